@@ -1,0 +1,167 @@
+"""Command line: ``torchkcreg register | warp | evaluate | info | demo``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torchkcreg
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; returns its exit status: 0, or 2 after a one-line error that names what was wrong."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        options.run(options)
+    except (ValueError, OSError) as error:
+        print(f"torchkcreg {options.command}: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"torchkcreg {options.command}: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="torchkcreg", description=torchkcreg.__doc__)
+    parser.add_argument("--version", action="version", version=f"torchkcreg {torchkcreg.__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_register(commands)
+    _add_warp(commands)
+    _add_evaluate(commands)
+    _add_info(commands)
+    _add_demo(commands)
+    return parser
+
+
+def _command(commands, name: str, run, text: str) -> argparse.ArgumentParser:
+    command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    command.set_defaults(run=run)
+    return command
+
+
+def _add_register(commands) -> None:
+    command = _command(commands, "register", _register, "measure the deformation of an implant in a few projections")
+    command.add_argument("--implant", type=Path, required=True, help="closed mesh of the undeformed implant (mm)")
+    command.add_argument("--geometry", type=Path, required=True, help="projection matrices (JSON)")
+    command.add_argument("--projections", type=Path, required=True, help="intensities or line integrals (NPZ, NPY, MHA)")
+    command.add_argument("--out", type=Path, required=True, help="run folder to make")
+    command.add_argument("--views", type=_integers, help="views to use, such as 15,16,17 (default: all)")
+    command.add_argument("--material", help="material of the implant, such as steel: polyenergetic DRRs")
+    command.add_argument("--spectrum", type=Path, help="detected spectrum: energy in keV, weight (CSV)")
+    command.add_argument("--components", type=Path, help="screws that move with the implant (JSON)")
+    command.add_argument("--init", type=Path, help="approximate implant_to_world (JSON)")
+    command.add_argument("--open-beam", type=float, help="unattenuated intensity, where the file does not say it")
+    command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
+    command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")
+    command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
+    command.add_argument("--seed", type=int, help="seed of the random numbers")
+    command.add_argument("--backend", help="projector: auto, cpp, triton or torch")
+    command.add_argument("--device", help="torch device")
+    command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
+    existing = command.add_mutually_exclusive_group()
+    existing.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
+    existing.add_argument("--resume", action="store_true", help="continue the run that the folder holds")
+
+
+def _integers(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"views must be integers separated by commas, got {text!r}") from None
+
+
+def _register(options: argparse.Namespace) -> None:
+    from torchkcreg.experiments import RegistrationFiles, register_files
+
+    files = RegistrationFiles(
+        implant=options.implant,
+        geometry=options.geometry,
+        projections=options.projections,
+        spectrum=options.spectrum,
+        components=options.components,
+        init=options.init,
+        views=options.views,
+        open_beam=options.open_beam,
+        config=options.config,
+    )
+    names = ("material", "preset", "pitch_mm", "seed", "backend", "device")
+    overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    register_files(
+        files,
+        options.out,
+        overrides=overrides,
+        overwrite=options.overwrite,
+        resume=options.resume,
+        figures=not options.no_figures,
+    )
+
+
+def _add_warp(commands) -> None:
+    command = _command(commands, "warp", _warp, "move points of the undeformed implant's frame to the world")
+    command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
+    command.add_argument("--points", type=Path, required=True, help="x,y,z in the implant's frame, mm (CSV)")
+    command.add_argument("--out", type=Path, required=True, help="CSV to write: x,y,z in the world, and whether outside")
+
+
+def _warp(options: argparse.Namespace) -> None:
+    from torchkcreg.io import read_points, read_run, write_points
+
+    result = read_run(options.run_folder)
+    points = read_points(options.points)
+    write_points(options.out, result.warp(points), outside=result.outside(points))
+
+
+def _add_evaluate(commands) -> None:
+    command = _command(commands, "evaluate", _evaluate, "compare a registration with known positions")
+    command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
+    command.add_argument("--points", type=Path, required=True, help="x,y,z before, in the implant's frame (CSV)")
+    command.add_argument("--truth", type=Path, required=True, help="x,y,z after, in the world (CSV)")
+    command.add_argument("--out", type=Path, help="JSON to write")
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from torchkcreg.evaluation import evaluate_points
+    from torchkcreg.io import read_points, read_run, write_json
+
+    result = read_run(options.run_folder)
+    metrics = evaluate_points(result.warp(read_points(options.points)), read_points(options.truth))
+    print(metrics)
+    if options.out:
+        write_json(options.out, metrics.to_dict())
+
+
+def _add_info(commands) -> None:
+    command = _command(commands, "info", _info, "say what a file or a run folder holds, or what is installed")
+    command.add_argument("paths", type=Path, nargs="*", help="meshes, geometries, projections, run folders")
+
+
+def _info(options: argparse.Namespace) -> None:
+    from torchkcreg.experiments import describe, describe_installation
+
+    for line in [describe_installation()] if not options.paths else map(describe, options.paths):
+        print(line)
+
+
+def _add_demo(commands) -> None:
+    command = _command(commands, "demo", _demo, "simulate a loaded plate, register it, evaluate and draw the result")
+    command.add_argument("--out", type=Path, default=Path("demo"), help="folder to make")
+    command.add_argument("--seed", type=int, default=0, help="seed of the simulated noise")
+    command.add_argument("--overwrite", action="store_true", help="replace the demo that the folder holds")
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from torchkcreg.experiments import demo
+
+    demo(options.out, seed=options.seed, overwrite=options.overwrite)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

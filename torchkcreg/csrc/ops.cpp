@@ -1,0 +1,15 @@
+// Schemas of the operators. Kernels register themselves in their own files; fake kernels and autograd are in Python
+// (projector/ops.py).
+
+#include <torch/csrc/stable/library.h>
+
+STABLE_TORCH_LIBRARY(torchkcreg, m) {
+  // points (B, N, 3), masses (N,), matrices (V, 3, 4), table (V, num_blocks, R + 1, R + 1, T, T) -> (B, V, rows, cols)
+  m.def(
+      "point_drr(Tensor points, Tensor masses, Tensor matrices, Tensor table, int block_size, int rows, int cols) "
+      "-> Tensor");
+  // Gradients to points, masses and matrices; one that is not needed comes back empty.
+  m.def(
+      "point_drr_backward(Tensor grad, Tensor points, Tensor masses, Tensor matrices, Tensor table, int block_size, "
+      "bool need_masses, bool need_matrices) -> (Tensor, Tensor, Tensor)");
+}

@@ -1,0 +1,171 @@
+"""The cubic B-spline basis at many points, worked on one knot cell at a time.
+
+All points of a knot cell (the box between eight neighbouring control points) share the same 64 control points. Sorted
+by cell, a spline is then a product of a (points, 64) matrix, built in cache and thrown away, with a (64, features)
+matrix: no gathering of 64 values a point, and nothing of size N x 64 in memory, in the backward pass neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchkcreg.deformation.bspline import bspline_pieces
+from torchkcreg.deformation.grid import ControlPointGrid
+
+_POINTS_PER_BLOCK = 1024  # (64, 1024) weights stay in a core's cache
+_Orders = tuple[int, int, int]
+_Blocks = list[tuple[int, Tensor]]
+
+
+class SplineBasis:
+    """Where points lie among the knots of a grid: evaluates splines there, and its adjoint.
+
+    Args:
+        grid: control points.
+        points: in the implant's frame, mm, shape (N, 3).
+        dtype: of the weights; the points' own if not given.
+
+    Raises:
+        ValueError: if the points' shape is another, or one is not finite.
+
+    Attributes:
+        eta: (N, 3), position of each point in its knot cell, 0 to 1; differentiable in the points.
+        cells: (num_cells, 3) long, lowest CP index of the 64 of each occupied cell; beyond the grid it may be negative.
+    """
+
+    def __init__(self, grid: ControlPointGrid, points: Tensor, dtype: torch.dtype | None = None) -> None:
+        if points.ndim != 2 or points.shape[-1] != 3:
+            raise ValueError(f"points must have shape (N, 3), got {tuple(points.shape)}")
+        if not torch.isfinite(points.detach()).all():
+            raise ValueError("points must be finite, got some that are not")
+        spacing = torch.tensor(grid.spacing, dtype=points.dtype, device=points.device)
+        knots = grid.to_grid(points) / spacing
+        below = knots.detach().floor()
+        self.eta = (knots - below).to(dtype or points.dtype)
+        self.cells, self._blocks = _sort_by_cell(below.long() - 1)
+        self._shape = grid.shape
+
+    def control_points(self) -> tuple[Tensor, Tensor]:
+        """Indices (num_cells, 64, 3) of the CPs of each cell, virtual ones included, and (num_cells, 64) of real CPs.
+
+        The latter are flat indices of the real CP nearest to each: itself, or the one on the border of the grid.
+        """
+        steps = torch.arange(4, device=self.cells.device)
+        offsets = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).reshape(64, 3)
+        indices = self.cells[:, None] + offsets
+        nx, ny, nz = self._shape
+        x, y, z = indices.unbind(-1)
+        return indices, (x.clamp(0, nx - 1) * ny + y.clamp(0, ny - 1)) * nz + z.clamp(0, nz - 1)
+
+    def evaluate(self, features: Tensor, orders: _Orders = (0, 0, 0)) -> Tensor:
+        """Splines ``sum_c B_c(x) features_c`` at the points, shape (N, F), differentiable in points and features.
+
+        Args:
+            features: of the CPs of each cell, shape (num_cells, 64, F), in the basis's dtype.
+            orders: of the derivative along each grid axis, in units of the spacing.
+        """
+        return _Evaluate.apply(self.eta, features, self._blocks, orders)
+
+    def scatter(self, values: Tensor, orders: _Orders = (0, 0, 0)) -> Tensor:
+        """Adjoint of `evaluate`: ``sum_n B_c(x_n) values_n`` for the CPs of each cell, shape (num_cells, 64, F).
+
+        Args:
+            values: of the points, shape (N, F), in the basis's dtype.
+            orders: as in `evaluate`.
+        """
+        return _Scatter.apply(self.eta, values, self._blocks, orders, len(self.cells))
+
+    def gradients(self) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Block by block of points in one cell: the cell, the points' indices (n,), and d B_c / d eta, (64, 3, n)."""
+        along = [_Workspace(self.eta.detach(), orders) for orders in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+        for cell, rows in self._blocks:
+            yield cell, rows, torch.stack([weights(rows) for weights in along], dim=1)
+
+
+class _Evaluate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, eta: Tensor, features: Tensor, blocks: _Blocks, orders: _Orders) -> Tensor:
+        ctx.save_for_backward(eta, features)
+        ctx.blocks, ctx.orders = blocks, orders
+        weights, size = _Workspace(eta, orders), features.shape[-1]
+        out, block = features.new_empty(len(eta), size), features.new_empty(_POINTS_PER_BLOCK, size)
+        for cell, rows in blocks:
+            out.index_copy_(0, rows, torch.mm(weights(rows).T, features[cell], out=block[: len(rows)]))
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        eta, features = ctx.saved_tensors
+        grad_eta = _slope(eta, features, grad, ctx) if ctx.needs_input_grad[0] else None
+        grad_features = None
+        if ctx.needs_input_grad[1]:
+            grad_features = _Scatter.apply(eta, grad, ctx.blocks, ctx.orders, len(features))
+        return grad_eta, grad_features, None, None
+
+
+class _Scatter(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, eta: Tensor, values: Tensor, blocks: _Blocks, orders: _Orders, num_cells: int) -> Tensor:
+        ctx.save_for_backward(eta, values)
+        ctx.blocks, ctx.orders = blocks, orders
+        out = values.new_zeros(num_cells, 64, values.shape[-1])
+        weights = _Workspace(eta, orders)
+        for cell, rows in blocks:
+            out[cell].addmm_(weights(rows), values[rows])
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        eta, values = ctx.saved_tensors
+        grad_eta = _slope(eta, grad, values, ctx) if ctx.needs_input_grad[0] else None
+        grad_values = None
+        if ctx.needs_input_grad[1]:
+            grad_values = _Evaluate.apply(eta, grad, ctx.blocks, ctx.orders)
+        return grad_eta, grad_values, None, None, None
+
+
+def _slope(eta: Tensor, features: Tensor, values: Tensor, ctx: Any) -> Tensor:
+    """Gradient (N, 3) by eta of ``sum_n values_n . spline(x_n)``: derivatives are splines again."""
+    steeper = [tuple(o + (a == axis) for a, o in enumerate(ctx.orders)) for axis in range(3)]
+    return torch.stack([(values * _Evaluate.apply(eta, features, ctx.blocks, o)).sum(-1) for o in steeper], dim=-1)
+
+
+class _Workspace:
+    """Weights of one block of points after the other, in memory that is asked for once.
+
+    Freshly allocated megabytes cost more than the arithmetic done in them.
+    """
+
+    def __init__(self, eta: Tensor, orders: _Orders) -> None:
+        self.eta, self.orders = eta, orders
+        self.pairs, self.weights = eta.new_empty(16 * _POINTS_PER_BLOCK), eta.new_empty(64 * _POINTS_PER_BLOCK)
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Weights (64, n) of n points, x offset slowest, valid until the next call.
+
+        Points run last, so that the products vectorise over them.
+        """
+        eta, n = self.eta[rows].T.contiguous(), len(rows)
+        x, y, z = (torch.stack(bspline_pieces(e, o)) for e, o in zip(eta, self.orders, strict=True))
+        pairs = torch.mul(x[:, None], y, out=self.pairs[: 16 * n].view(4, 4, n))
+        return torch.mul(pairs[:, :, None], z, out=self.weights[: 64 * n].view(4, 4, 4, n)).view(64, n)
+
+
+def _sort_by_cell(lowest: Tensor) -> tuple[Tensor, _Blocks]:
+    """Occupied cells (num_cells, 3), and the points of each in blocks of bounded size: (cell, indices of points)."""
+    if len(lowest) == 0:
+        return lowest, []
+    start = lowest.amin(0)
+    extent = (lowest.amax(0) - start + 1).tolist()
+    x, y, z = (lowest - start).unbind(-1)
+    key, order = torch.sort((x * extent[1] + y) * extent[2] + z, stable=True)
+    _, counts = torch.unique_consecutive(key, return_counts=True)
+    blocks: _Blocks = []
+    for cell, rows in enumerate(order.split(counts.tolist())):
+        blocks += [(cell, block) for block in rows.split(_POINTS_PER_BLOCK)]
+    first = order[counts.cumsum(0) - counts]
+    return lowest[first], blocks

@@ -1,0 +1,151 @@
+"""Groups of control points that move rigidly: their motions, and what nodes need to follow them.
+
+Group g turns by R_g about its centre c_g and shifts by t_g: phi_c = (R_g - I)(c - c_g) + t_g. A spline is linear in
+phi, so a node moves by sum_g W_g t_g + (R_g - I) M_g, with moments W_g and M_g that depend on its reference position
+only. Everything here is in the axes of the grid's frame.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from torchkcreg.deformation.basis import SplineBasis
+from torchkcreg.deformation.grid import ControlPointGrid
+
+
+def group_centers(grid: ControlPointGrid, labels: Tensor) -> Tensor:
+    """Mean position (G, 3) of each group's control points in the grid's frame, mm, float64.
+
+    Args:
+        grid: control points.
+        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+
+    Raises:
+        ValueError: if labels have another shape, are negative or leave a group out.
+    """
+    _check_labels(grid, labels)
+    members = one_hot(labels.flatten()).T.double()
+    count = members.sum(-1, keepdim=True)
+    if not (count > 0).all():
+        missing = (count[:, 0] == 0).nonzero().flatten().tolist()
+        raise ValueError(f"labels must use every group from 0 to {len(count) - 1}, got none of {missing}")
+    return members @ grid.positions().to(members).reshape(-1, 3) / count
+
+
+def group_moments(
+    grid: ControlPointGrid,
+    labels: Tensor,
+    points: Tensor,
+    *,
+    num_groups: int | None = None,
+    dtype: torch.dtype | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Moments W (N, G) and M (N, G, 3) of the B-spline weights at each point, by group.
+
+    W_g(x) = sum_{c in g} B_c(x) and M_g(x) = sum_{c in g} B_c(x) (c - c_g), mm, about the groups' centres, in the
+    grid's axes. CPs beyond the grid count to the group of the nearest real CP. Both are views of one (N, 4 G) tensor.
+
+    Args:
+        grid: control points.
+        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        points: in the implant's frame, mm, shape (N, 3).
+        num_groups: G, checked if given.
+        dtype: of the work and the result; the points' own if not given.
+
+    Raises:
+        ValueError: if shapes or groups do not fit.
+
+    Example:
+        >>> grid = ControlPointGrid((4, 4, 4), (10.0, 10.0, 10.0), torch.eye(4))
+        >>> one_group = torch.zeros(4, 4, 4, dtype=torch.long)
+        >>> shares, moments = group_moments(grid, one_group, torch.tensor([[18.0, 12.0, 16.0]]))
+        >>> shares.round(decimals=3).tolist(), moments.round(decimals=3).tolist()
+        ([[1.0]], [[[3.0, -3.0, 1.0]]])
+    """
+    centers = group_centers(grid, labels)
+    groups = len(centers)
+    if num_groups is not None and num_groups != groups:
+        raise ValueError(f"labels must hold {num_groups} groups, got {groups}")
+    basis = SplineBasis(grid, points, dtype)
+    indices, nearest = basis.control_points()
+    member = one_hot(labels.to(indices.device).flatten()[nearest], groups).double()
+    spacing = torch.tensor(grid.spacing, dtype=torch.float64, device=indices.device)
+    arms = (indices * spacing)[:, :, None] - centers.to(indices.device)
+    features = torch.cat([member, (member[..., None] * arms).flatten(-2)], dim=-1)
+    moments = basis.evaluate(features.to(basis.eta.dtype))
+    return moments[:, :groups], moments[:, groups:].unflatten(-1, (groups, 3))
+
+
+def displacement_from_groups(shares: Tensor, moments: Tensor, rotations: Tensor, translations: Tensor) -> Tensor:
+    """Displacements (..., N, 3), mm, of nodes whose groups of control points move rigidly, in the grid's axes.
+
+    u = sum_g W_g t_g + (R_g - I) M_g, as one matrix product for all candidates.
+
+    Args:
+        shares: W of `group_moments`, (N, G).
+        moments: M of `group_moments`, (N, G, 3), mm.
+        rotations: of the groups about their centres, (..., G, 3, 3).
+        translations: of the groups' centres, mm, (..., G, 3).
+    """
+    turns = (rotations - torch.eye(3).to(rotations)).mT.flatten(-3, -2)
+    return shares @ translations.to(shares) + moments.flatten(-2) @ turns.to(moments)
+
+
+def control_points_from_groups(
+    grid: ControlPointGrid, labels: Tensor, rotations: Tensor, translations: Tensor
+) -> Tensor:
+    """Control-point displacements phi (..., nx, ny, nz, 3), mm, of rigidly moving groups, in the grid's axes.
+
+    phi_c = (R_g - I)(c - c_g) + t_g.
+
+    Args:
+        grid: control points.
+        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        rotations: of the groups about their centres, (..., G, 3, 3).
+        translations: of the groups' centres, mm, (..., G, 3).
+    """
+    centers = group_centers(grid, labels).to(translations)
+    if rotations.shape[-3:] != (len(centers), 3, 3) or translations.shape[-2:] != (len(centers), 3):
+        raise ValueError(
+            f"rotations and translations must be of {len(centers)} groups, "
+            f"got {tuple(rotations.shape)} and {tuple(translations.shape)}"
+        )
+    group = labels.flatten()
+    arms = grid.positions().to(translations).reshape(-1, 3) - centers[group]
+    turns = (rotations - torch.eye(3).to(rotations))[..., group, :, :]
+    phi = (turns @ arms[:, :, None]).squeeze(-1) + translations[..., group, :]
+    return phi.unflatten(-2, grid.shape)
+
+
+def split_motions(
+    grid: ControlPointGrid, parent_labels: Tensor, child_labels: Tensor, rotations: Tensor, translations: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Rotations (..., H, 3, 3) and translations (..., H, 3) of finer groups that move as their parents do.
+
+    Args:
+        grid: control points.
+        parent_labels: coarse groups 0 to G - 1, (nx, ny, nz).
+        child_labels: groups 0 to H - 1, each part of one coarse group, (nx, ny, nz).
+        rotations: of the coarse groups, (..., G, 3, 3).
+        translations: of the coarse groups' centres, mm, (..., G, 3).
+
+    Raises:
+        ValueError: if a fine group is not part of one coarse group.
+    """
+    parents, children = group_centers(grid, parent_labels), group_centers(grid, child_labels)
+    pairs = torch.unique(torch.stack([child_labels.flatten(), parent_labels.flatten()]), dim=1)
+    if pairs.shape[1] != len(children):
+        raise ValueError(f"child_labels must refine parent_labels, got {pairs.shape[1]} overlaps of {len(children)}")
+    parent = pairs[1]
+    arms = (children - parents[parent]).to(translations)
+    turned = rotations[..., parent, :, :]
+    return turned, (turned @ arms[:, :, None]).squeeze(-1) - arms + translations[..., parent, :]
+
+
+def _check_labels(grid: ControlPointGrid, labels: Tensor) -> None:
+    if labels.shape != grid.shape or labels.is_floating_point():
+        raise ValueError(f"labels must be integers of shape {grid.shape}, got {labels.dtype} {tuple(labels.shape)}")
+    if int(labels.min()) < 0:
+        raise ValueError(f"labels must not be negative, got {int(labels.min())}")

@@ -1,0 +1,90 @@
+"""Displacement maps: how an implant bent, seen from its distal end (fig. 3B of the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchkcreg.geometry import fit_rigid, transform_points
+
+
+@dataclass(frozen=True)
+class DisplacementMap:
+    """Displacements of an implant's nodes relative to its distal end.
+
+    Attributes:
+        undeformed: the undeformed nodes laid onto the deformed ones at the distal end, (N, 3) in the world, mm.
+        vectors: from there to the deformed nodes, (N, 3), mm.
+        magnitudes: their lengths (N,), mm.
+        distal: the nodes that were aligned, bool (N,).
+        alignment: the rigid motion (4, 4) that laid them there.
+    """
+
+    undeformed: Tensor
+    vectors: Tensor
+    magnitudes: Tensor
+    distal: Tensor
+    alignment: Tensor
+
+    @property
+    def deformed(self) -> Tensor:
+        """The deformed nodes (N, 3) in the world, mm."""
+        return self.undeformed + self.vectors
+
+
+def displacement_map(
+    points: Tensor,
+    warped: Tensor,
+    *,
+    distal_fraction: float = 0.25,
+    weights: Tensor | None = None,
+    distal_direction: tuple[float, float, float] = (0.0, 0.0, -1.0),
+) -> DisplacementMap:
+    """How far each node of an implant moved when the undeformed and the deformed one agree at the distal end.
+
+    "The bottom portions of undeformed and deformed point clouds were first rigidly registered, and the Euclidean
+    distance between the two clouds at every node was then calculated" (section 2.4 of Cao et al. 2020). The motion of
+    the implant as a whole drops out; an implant that only moved has a map of zeros.
+
+    Args:
+        points: nodes (N, 3) of the undeformed implant, in any frame, mm.
+        warped: the same nodes deformed, (N, 3) in the world, mm.
+        distal_fraction: share of the implant's length, from the distal end, that is aligned; in (0, 1].
+        weights: (N,), the nodes' volumes; equal where not given.
+        distal_direction: the world's direction to the distal end; by default down, away from the body. Of the two
+            ends of the implant's long axis the one farther that way is the distal one.
+
+    Raises:
+        ValueError: shapes differ, the fraction is outside (0, 1], or fewer than three nodes lie in it.
+
+    >>> straight = torch.tensor([[x, 0.0, z] for z in range(9) for x in range(2)])
+    >>> bent = straight + torch.tensor([[0.0, max(0.0, z - 4.0), 0.0] for z in range(9) for x in range(2)])
+    >>> displacement_map(straight, bent).magnitudes[::2].abs().round(decimals=3).tolist()
+    [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0]
+    """
+    if points.ndim != 2 or points.shape[-1] != 3 or points.shape != warped.shape:
+        shapes = f"{tuple(points.shape)} and {tuple(warped.shape)}"
+        raise ValueError(f"points and warped must both have shape (N, 3), got {shapes}")
+    if not 0 < distal_fraction <= 1:
+        raise ValueError(f"distal_fraction must be in (0, 1], got {distal_fraction}")
+    points, warped = points.detach().double(), warped.detach().double().to(points.device)
+    along = _along_the_implant(points, warped, torch.tensor(distal_direction, dtype=torch.float64))
+    distal = along <= along.min() + distal_fraction * (along.max() - along.min())
+    if int(distal.sum()) < 3:
+        raise ValueError(f"distal_fraction {distal_fraction} holds {int(distal.sum())} nodes, at least 3 are needed")
+    shares = None if weights is None else weights.to(points)[distal]
+    alignment = fit_rigid(points[distal], warped[distal], shares)
+    undeformed = transform_points(alignment, points)
+    vectors = warped - undeformed
+    return DisplacementMap(undeformed, vectors, torch.linalg.vector_norm(vectors, dim=-1), distal, alignment)
+
+
+def _along_the_implant(points: Tensor, warped: Tensor, distal_direction: Tensor) -> Tensor:
+    """Position (N,) of each node along the implant's long axis, smallest at the distal end."""
+    centered = points - points.mean(0)
+    axis = torch.linalg.eigh(centered.mT @ centered).eigenvectors[:, -1]
+    along = centered @ axis
+    downwards = (warped - warped.mean(0)) @ distal_direction.to(warped)
+    return along if float((along * downwards).sum()) <= 0 else -along

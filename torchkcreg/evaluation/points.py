@@ -1,0 +1,113 @@
+"""Errors of points: where the registration puts them against where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+def point_errors(estimated: Tensor, truth: Tensor) -> Tensor:
+    """Distances (..., N) in mm between estimated and true points (..., N, 3).
+
+    Raises:
+        ValueError: the shapes differ.
+
+    >>> point_errors(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]])).tolist()
+    [5.0]
+    """
+    if estimated.ndim < 2 or estimated.shape != truth.shape or estimated.shape[-1] != 3:
+        shapes = f"{tuple(estimated.shape)} and {tuple(truth.shape)}"
+        raise ValueError(f"estimated and truth must both have shape (..., N, 3), got {shapes}")
+    return torch.linalg.vector_norm(estimated - truth.to(estimated), dim=-1)
+
+
+def bb_rmse(estimated: Tensor, truth: Tensor) -> Tensor:
+    """Root mean square (...) of the distances in mm between estimated and true points (..., N, 3).
+
+    The paper's measure of a registration, with the reference BBs as points (section 2.4, table 1 of Cao et al. 2020).
+
+    Raises:
+        ValueError: the shapes differ, or there is no point.
+
+    >>> bb_rmse(torch.zeros(2, 3), torch.tensor([[1.0, 0.0, 0.0], [0.0, 7.0, 0.0]])).item()
+    5.0
+    """
+    errors = point_errors(estimated, truth)
+    if errors.shape[-1] == 0:
+        raise ValueError("bb_rmse needs at least one point, got none")
+    return errors.square().mean(-1).sqrt()
+
+
+class Registered(Protocol):
+    """What can be evaluated: a `torchkcreg.registration.RegistrationResult`, or anything else that warps points."""
+
+    gc: Tensor
+    warp: Callable[[Tensor], Tensor]
+    outside: Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class PointMetrics:
+    """Errors of a registration at reference points, all lengths in mm.
+
+    Attributes:
+        num_points: how many reference points.
+        rmse_mm: root mean square distance.
+        mean_mm: mean distance.
+        median_mm: median distance.
+        max_mm: largest distance.
+        rmse_xyz_mm: root mean square error along world x, y and z; their squares add up to that of `rmse_mm`.
+        motion_rms_mm: root mean square distance that the points moved in truth, where their start is known.
+        num_outside: points beyond the control-point grid's valid domain, where the field is only continued.
+        gc: final gradient correlation of each view.
+    """
+
+    num_points: int
+    rmse_mm: float
+    mean_mm: float
+    median_mm: float
+    max_mm: float
+    rmse_xyz_mm: tuple[float, float, float]
+    motion_rms_mm: float | None
+    num_outside: int
+    gc: tuple[float, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """The metrics as plain data, for `metrics.json`."""
+        return asdict(self)
+
+
+def evaluate(result: Registered, points: Tensor, truth: Tensor, *, start: Tensor | None = None) -> PointMetrics:
+    """Errors of a registration at reference points such as BBs.
+
+    Args:
+        result: the registration.
+        points: reference points (N, 3) in the implant's frame, on or near the undeformed implant.
+        truth: where they are in the world at the time of the projections (N, 3).
+        start: where they were before (N, 3), to tell how far they moved.
+
+    Raises:
+        ValueError: shapes differ, or there is no point.
+    """
+    points, truth = points.double(), truth.double()
+    if points.ndim != 2:
+        raise ValueError(f"points must have shape (N, 3), got {tuple(points.shape)}")
+    warped = result.warp(points).to(truth)
+    errors = point_errors(warped, truth)
+    rmse = bb_rmse(warped, truth)
+    x, y, z = (warped - truth).square().mean(0).sqrt().tolist()
+    return PointMetrics(
+        num_points=len(points),
+        rmse_mm=float(rmse),
+        mean_mm=float(errors.mean()),
+        median_mm=float(errors.median()),
+        max_mm=float(errors.max()),
+        rmse_xyz_mm=(x, y, z),
+        motion_rms_mm=None if start is None else float(bb_rmse(start.double(), truth)),
+        num_outside=int(result.outside(points).sum()),
+        gc=tuple(result.gc.tolist()),
+    )

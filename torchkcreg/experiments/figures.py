@@ -1,0 +1,5 @@
+"""Pictures of a registration."""
+
+
+def draw_registration(result, scene, data, initial):
+    return {}

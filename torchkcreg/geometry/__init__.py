@@ -1,0 +1,32 @@
+"""Cone-beam geometry: projection matrices, the multisource scanner, rigid motions and voxel grids.
+
+The world is right-handed in mm with z along the gantry's axis; a view is one 3 x 4 projection matrix, and everything
+else about it (source, rays, pixel positions) is derived from that.
+"""
+
+from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
+from torchkcreg.geometry.cone_beam import ConeBeamGeometry
+from torchkcreg.geometry.multisource import MultisourceScanner
+from torchkcreg.geometry.se3 import (
+    fit_rigid,
+    invert_rigid,
+    rigid_matrix,
+    rotation_from_vector,
+    transform_points,
+    vector_from_rotation,
+)
+from torchkcreg.geometry.volume_grid import VolumeGrid
+
+__all__ = [
+    "ConeBeamGeometry",
+    "MultisourceScanner",
+    "VolumeGrid",
+    "circular_geometry",
+    "fit_rigid",
+    "invert_rigid",
+    "matrices_from_frames",
+    "rigid_matrix",
+    "rotation_from_vector",
+    "transform_points",
+    "vector_from_rotation",
+]

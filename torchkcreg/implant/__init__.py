@@ -1,0 +1,21 @@
+"""Known components: an implant as a point cloud of nodes, volumes and cells, from a mesh or from a volume; screws."""
+
+from torchkcreg.implant.closed_mesh import closed_triangles
+from torchkcreg.implant.components import Component, cylinder_cloud, cylinder_mesh
+from torchkcreg.implant.morton import morton_order
+from torchkcreg.implant.partial_volumes import FilledCells, fill_cells
+from torchkcreg.implant.point_cloud import ImplantPointCloud
+from torchkcreg.implant.voxelize import voxelize_mesh, voxelize_points
+
+__all__ = [
+    "Component",
+    "FilledCells",
+    "ImplantPointCloud",
+    "closed_triangles",
+    "cylinder_cloud",
+    "cylinder_mesh",
+    "fill_cells",
+    "morton_order",
+    "voxelize_mesh",
+    "voxelize_points",
+]

@@ -1,0 +1,53 @@
+"""Files in and out: geometry, projections, meshes, spectra, points, poses, configurations, runs and figures.
+
+Only this folder touches a disk. What it reads is checked, and an error is one line that names the file and the key;
+what it writes is there whole or not at all.
+"""
+
+from .components import ComponentSpec, read_components, write_components
+from .config import read_config, write_config
+from .figures import write_figure
+from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
+from .init import read_init, write_init
+from .meshes import read_mesh, write_mesh, write_point_cloud_ply
+from .points import read_points, write_points
+from .projections import Projections, read_projections, write_projections
+from .results import result_from_dict, result_to_dict
+from .runs import RunFolder, read_run
+from .spectra import read_spectrum, write_spectrum
+from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
+from .versions import versions
+
+__all__ = [
+    "ComponentSpec",
+    "Projections",
+    "RunFolder",
+    "displacement_field",
+    "geometry_from_dict",
+    "geometry_to_dict",
+    "itk_transform",
+    "read_components",
+    "read_config",
+    "read_geometry",
+    "read_init",
+    "read_mesh",
+    "read_points",
+    "read_projections",
+    "read_run",
+    "read_spectrum",
+    "result_from_dict",
+    "result_to_dict",
+    "versions",
+    "write_components",
+    "write_config",
+    "write_displacement_field",
+    "write_figure",
+    "write_geometry",
+    "write_init",
+    "write_itk_transform",
+    "write_mesh",
+    "write_point_cloud_ply",
+    "write_points",
+    "write_projections",
+    "write_spectrum",
+]

@@ -1,0 +1,65 @@
+"""Configurations: one YAML or JSON file describes a run."""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import Any
+
+import yaml
+
+from torchkcreg.io.files import plain, read_text, write_text
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML that refuses a key given twice, where plain YAML would silently take the last."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+            if isinstance(key, str) and key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+            seen.add(key if isinstance(key, str) else repr(key))
+        return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 takes 1e-4 (no point) for a text.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The mapping in a YAML or JSON file (JSON is YAML); an empty file is an empty mapping.
+
+    Values are plain data: nothing in the file is executed. What the keys mean is validated by whoever takes them.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no YAML, no mapping, has a key twice or a key that is no text; the message names the line.
+    """
+    text = read_text(path, "configuration")
+    try:
+        content = yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ValueError(f"configuration file {path} is not valid YAML: {_one_line(error)}") from error
+    content = {} if content is None else content
+    if not isinstance(content, dict):
+        raise ValueError(f"configuration file {path} must hold keys and values, got {type(content).__name__}")
+    for key in content:
+        if not isinstance(key, str):
+            raise ValueError(f"configuration file {path}: keys must be texts, got {key!r}")
+    return content
+
+
+def write_config(path: str | os.PathLike[str], config: dict[str, Any]) -> None:
+    """Nothing; writes a mapping of plain data as YAML, in its own order."""
+    write_text(path, yaml.safe_dump(plain(config), sort_keys=False, allow_unicode=True, width=120))
+
+
+def _one_line(error: Exception) -> str:
+    problem = getattr(error, "problem", None)
+    mark = getattr(error, "problem_mark", None)
+    text = str(problem) if problem else (str(error).splitlines() or ["cannot be parsed"])[0]
+    return text if mark is None else f"line {mark.line + 1}: {text}"

@@ -1,0 +1,148 @@
+"""Reading with errors that name the file, and writing that never leaves half a file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+TEMPORARY_PREFIX = ".writing-"
+
+
+def existing_file(path: str | os.PathLike[str], what: str) -> Path:
+    """The path of an existing regular file.
+
+    Args:
+        path: where it should be.
+        what: what the file is, for the error message ("geometry", "mesh", ...).
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        ValueError: it is a folder or something else that is not a file.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{what} file {path} does not exist")
+    if not path.is_file():
+        raise ValueError(f"{what} file {path} is not a file")
+    return path
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends well, and vanishes when it fails.
+
+    The temporary name ends like the final one, since many writers choose their format by it.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with atomic_path(folder / "answer.txt") as temporary:
+    ...     _ = temporary.write_text("42")
+    >>> [entry.name for entry in folder.iterdir()]
+    ['answer.txt']
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"folder {path.parent} does not exist, so {path.name} cannot be written there")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder, not a file to write")
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Nothing; writes a UTF-8 text file, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_text(path: str | os.PathLike[str], what: str) -> str:
+    """The text of a UTF-8 file; ValueError names a file that is something else."""
+    path = existing_file(path, what)
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{what} file {path} is not a text file (UTF-8): {error.reason}") from error
+
+
+def read_json(path: str | os.PathLike[str], what: str) -> Any:
+    """The content of a JSON file; ValueError names a file that is no JSON and the line where it breaks."""
+    text = read_text(path, what)
+    try:
+        return json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"{what} file {path} is not valid JSON: {error}") from error
+
+
+def write_json(path: str | os.PathLike[str], content: Any, *, indent: int | None = 1) -> None:
+    """Nothing; writes `content` as strict JSON, whole or not at all (see `plain` for what it may hold)."""
+    write_text(path, json.dumps(plain(content), indent=indent, allow_nan=False) + "\n")
+
+
+def plain(content: Any) -> Any:
+    """`content` as numbers, strings, lists and dicts: what JSON, YAML and a checkpoint can hold.
+
+    Tensors and arrays become (nested) lists, NumPy scalars numbers, tuples lists, paths strings. JSON knows no NaN
+    and no infinity: they become None.
+
+    Raises:
+        ValueError: something else is in it; names its type and where it is.
+    """
+    return _plain(content, "")
+
+
+def _plain(content: Any, where: str) -> Any:
+    if content is None or isinstance(content, (bool, int, str)):
+        return content
+    if isinstance(content, float):
+        return float(content) if math.isfinite(content) else None
+    if isinstance(content, torch.Tensor):
+        return _plain(content.detach().cpu().tolist(), where)
+    if isinstance(content, (np.ndarray, np.generic)):
+        return _plain(content.tolist(), where)
+    if isinstance(content, os.PathLike):
+        return os.fspath(content)
+    if isinstance(content, dict):
+        return {str(key): _plain(value, f"{where}[{key!r}]") for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_plain(value, f"{where}[{i}]") for i, value in enumerate(content)]
+    raise ValueError(f"cannot write a {type(content).__name__} as plain data{f' (at {where})' if where else ''}")
+
+
+def finite_number(value: Any, name: str, *, positive: bool = False) -> float:
+    """`value` as a float; ValueError(name ...) when it is no finite number, or not above zero where asked."""
+    wanted = "a positive number" if positive else "a finite number"
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    if positive and value <= 0:
+        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    return float(value)
+
+
+def finite_array(value: Any, shape: tuple[int, ...], name: str) -> torch.Tensor:
+    """`value` (nested lists) as a float64 tensor of `shape`; ValueError(name ...) when it is anything else."""
+    try:
+        array = np.array(value)
+    except ValueError:
+        array = np.array(None)
+    if array.shape != shape or array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be {' x '.join(map(str, shape))} numbers, got {_short(value)}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {_short(value)}")
+    return torch.from_numpy(array.astype(np.float64))
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,108 @@
+"""Implant surfaces from CAD files, and point clouds for viewers."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from torchkcreg.implant import closed_triangles
+from torchkcreg.io.files import atomic_path, existing_file
+
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".3mf")
+_SMALLEST_MM, _LARGEST_MM = 1.0, 1000.0
+
+
+def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
+    """The closed surface of an STL, OBJ, PLY, OFF or 3MF file, in mm as the file has it, oriented outwards.
+
+    Equal vertices are merged, faces that this collapses dropped; several bodies in one file are one surface. A largest
+    extent under 1 mm or over 1000 mm gives a warning: the file is probably in metres, or not in mm.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read as a mesh, is empty, or is open; the message counts the open edges.
+    """
+    path = existing_file(path, "mesh")
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise ValueError(f"mesh file {path} must be one of {', '.join(MESH_SUFFIXES)}")
+    try:
+        mesh = trimesh.load(str(path), force="mesh", process=True)
+    except Exception as error:  # each of trimesh's parsers fails in its own way
+        hint = " (3MF needs the package lxml)" if suffix == ".3mf" and _lacks("lxml") else ""
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"mesh file {path} cannot be read: {reason}{hint}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise ValueError(f"mesh file {path} holds no triangles")
+    try:
+        triangles = closed_triangles(mesh)
+    except ValueError as error:
+        raise ValueError(f"mesh file {path}: {error}") from error
+    closed = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=True)
+    _warn_about_size(path, closed)
+    return closed
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:
+    """Nothing; writes a surface, its format chosen by the suffix (.stl, .obj, .ply, .off)."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in MESH_SUFFIXES[:-1]:
+        raise ValueError(f"meshes are written as {', '.join(MESH_SUFFIXES[:-1])}, got {path}")
+    with atomic_path(path) as temporary:
+        mesh.export(str(temporary), file_type=suffix[1:])
+
+
+def write_point_cloud_ply(path: str | os.PathLike[str], points: Tensor, displacement: Tensor | None = None) -> None:
+    """Nothing; writes points as a binary PLY that ParaView, MeshLab, CloudCompare and 3D Slicer open.
+
+    Args:
+        path: the file.
+        points: (N, 3) in mm.
+        displacement: (N, 3) in mm, becomes the vertex fields `dx`, `dy`, `dz` and its length `displacement`.
+
+    Raises:
+        ValueError: shapes don't fit, or there is no point.
+    """
+    if points.ndim != 2 or points.shape[-1] != 3 or len(points) == 0:
+        raise ValueError(f"points must have shape (N, 3), N > 0, got {tuple(points.shape)}")
+    columns = {name: points[:, i] for i, name in enumerate("xyz")}
+    if displacement is not None:
+        if displacement.shape != points.shape:
+            raise ValueError(f"displacement must have shape {tuple(points.shape)}, got {tuple(displacement.shape)}")
+        columns |= {f"d{name}": displacement[:, i] for i, name in enumerate("xyz")}
+        columns["displacement"] = torch.linalg.vector_norm(displacement, dim=-1)
+    table = np.empty(len(points), dtype=[(name, "<f4") for name in columns])
+    for name, column in columns.items():
+        table[name] = column.detach().cpu().numpy()
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment lengths in mm",
+        f"element vertex {len(points)}",
+        *(f"property float {name}" for name in columns),
+        "end_header",
+    ]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes())
+
+
+def _warn_about_size(path: Path, mesh: trimesh.Trimesh) -> None:
+    extents = " x ".join(f"{e:.4g}" for e in mesh.extents)
+    if mesh.extents.max() < _SMALLEST_MM:
+        warnings.warn(f"mesh file {path} is {extents} mm: it is probably in metres", stacklevel=3)
+    elif mesh.extents.max() > _LARGEST_MM:
+        warnings.warn(f"mesh file {path} is {extents} mm: it is probably not in mm", stacklevel=3)
+
+
+def _lacks(package: str) -> bool:
+    try:
+        __import__(package)
+    except ImportError:
+        return True
+    return False

@@ -1,0 +1,206 @@
+"""Run folders: everything that a registration leaves behind, each file whole or not there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchkcreg.geometry import transform_points
+from torchkcreg.io.config import write_config
+from torchkcreg.io.figures import write_figure
+from torchkcreg.io.files import TEMPORARY_PREFIX, atomic_path, read_json, write_json
+from torchkcreg.io.meshes import write_point_cloud_ply
+from torchkcreg.io.results import result_from_dict, result_to_dict
+from torchkcreg.io.transforms import warp, write_displacement_field, write_itk_transform
+from torchkcreg.io.versions import versions
+from torchkcreg.registration import RegistrationResult
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CONFIG, VERSIONS, HISTORY, METRICS = "config.yaml", "versions.json", "history.json", "metrics.json"
+DEFORMATION, FIELD, TRANSFORM, CLOUD = "deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply"
+CHECKPOINT = "checkpoint.pt"
+FIGURES = ("overlay.png", "displacement.png", "history.png")
+RUN_FILES = (DEFORMATION, CONFIG, VERSIONS, HISTORY, METRICS, FIELD, TRANSFORM, CLOUD, CHECKPOINT, *FIGURES)
+_FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+class RunFolder:
+    """A registration on disk.
+
+    | file | what |
+    | --- | --- |
+    | `config.yaml` | the resolved configuration; there from the start |
+    | `versions.json` | torchkcreg, torch, numpy, ..., platform, threads |
+    | `checkpoint.pt` | the trainer's state, replaced as the run goes on |
+    | `history.json` | a record an iteration |
+    | `metrics.json` | what was measured |
+    | `deformation.json` | all parameters of the result; written last, so where it is the run is complete |
+    | `dvf.mha` | displacement field, see `displacement_field` |
+    | `bspline.tfm` | ITK transform, see `itk_transform` |
+    | `implant_deformed.ply` | the deformed point cloud with the displacement of each node |
+    | `overlay.png`, `displacement.png`, `history.png` | figures |
+
+    Use `RunFolder.create` for a new or resumed run and `read_run` for a finished one.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    @classmethod
+    def create(cls, path: str | os.PathLike[str], *, overwrite: bool = False, resume: bool = False) -> RunFolder:
+        """A run folder ready to be written to.
+
+        Args:
+            path: the folder; made, parents too, where it does not exist. An empty one is taken as it is.
+            overwrite: discard the run in it: the files that a run writes are deleted, others stay.
+            resume: go on with the run in it.
+
+        Raises:
+            FileExistsError: there is a run and neither is asked for, or files that are no run.
+            FileNotFoundError: there is no run to resume.
+            NotADirectoryError: the path, or one above it, is a file.
+            ValueError: both are asked for.
+        """
+        if overwrite and resume:
+            raise ValueError("a run is either overwritten or resumed, not both")
+        run = cls(path)
+        try:
+            run.path.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise NotADirectoryError(f"run folder {run.path} cannot be made: a file is in the way") from error
+        for leftover in run.path.glob(f"{TEMPORARY_PREFIX}*"):  # of a run that was killed while writing
+            leftover.unlink(missing_ok=True)
+        is_run = (run.path / CONFIG).is_file()
+        if resume:
+            if not is_run:
+                raise FileNotFoundError(f"run folder {run.path} holds no run to resume (no {CONFIG})")
+            return run
+        if not any(run.path.iterdir()):
+            return run
+        if not is_run:
+            raise FileExistsError(f"folder {run.path} is not empty and holds no run: choose another one")
+        if not overwrite:
+            raise FileExistsError(f"run folder {run.path} holds a run already: overwrite or resume it")
+        run._discard()
+        return run
+
+    def start(self, config: dict[str, Any]) -> None:
+        """Nothing; writes `config.yaml`, which makes the folder a run, and `versions.json`."""
+        write_config(self.path / CONFIG, config)
+        write_json(self.path / VERSIONS, versions())
+
+    def save_checkpoint(self, state: dict[str, Any]) -> None:
+        """Nothing; writes the checkpoint, in place of the last one only when it is whole.
+
+        Raises:
+            ValueError: something in it is neither a tensor nor plain data, and where; it could not be loaded safely.
+        """
+        _require_loadable(state, "state")
+        with atomic_path(self.path / CHECKPOINT) as temporary:
+            torch.save(state, temporary)
+
+    def load_checkpoint(self) -> dict[str, Any] | None:
+        """The last checkpoint, on the CPU, or None where there is none yet; nothing in the file is executed.
+
+        Raises:
+            ValueError: the file cannot be read.
+        """
+        path = self.path / CHECKPOINT
+        if not path.is_file():
+            return None
+        try:
+            return torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # torch.load fails in many ways on a damaged file
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise ValueError(f"checkpoint {path} cannot be read: {reason[:120]}") from error
+
+    def write_history(self, history: list[dict[str, Any]]) -> None:
+        """Nothing; writes `history.json`."""
+        write_json(self.path / HISTORY, history)
+
+    def write_metrics(self, metrics: dict[str, Any]) -> None:
+        """Nothing; writes `metrics.json`."""
+        write_json(self.path / METRICS, metrics)
+
+    def write_figure(self, name: str, figure: Figure) -> None:
+        """Nothing; writes a figure under a file name such as `overlay.png`."""
+        if Path(name).name != name or Path(name).suffix not in _FIGURE_SUFFIXES:
+            raise ValueError(f"name must be a file name ending in {', '.join(_FIGURE_SUFFIXES)}, got {name!r}")
+        write_figure(self.path / name, figure)
+
+    def write_result(
+        self, result: RegistrationResult, points: Tensor, *, initial_to_world: Tensor | None = None
+    ) -> None:
+        """Nothing; writes history, displacement field, ITK transform, deformed cloud and, last, `deformation.json`.
+
+        Args:
+            result: the registration.
+            points: the implant's nodes (N, 3) in its own frame.
+            initial_to_world: pose (4, 4) from which the cloud's displacements are counted; the identity if not given.
+
+        Raises:
+            ValueError: a parameter is not finite.
+        """
+        content = result_to_dict(result)  # refuses what cannot be written before anything is
+        pose = (
+            torch.eye(4, dtype=torch.float64) if initial_to_world is None else initial_to_world.detach().cpu().double()
+        )
+        moved = warp(result.implant_to_world, result.deformation, points)
+        displacement = moved - transform_points(pose, points.detach().cpu().double())
+        (self.path / DEFORMATION).unlink(missing_ok=True)
+        self.write_history(result.history)
+        write_displacement_field(self.path / FIELD, result.implant_to_world, result.deformation)
+        write_itk_transform(self.path / TRANSFORM, result.implant_to_world, result.deformation)
+        write_point_cloud_ply(self.path / CLOUD, moved, displacement)
+        write_json(self.path / DEFORMATION, content, indent=None)
+
+    def read_result(self) -> RegistrationResult:
+        """The result in the folder; see `read_run`."""
+        path = self.path / DEFORMATION
+        if not path.is_file():
+            state = "is not finished" if (self.path / CONFIG).is_file() else "is no run"
+            raise FileNotFoundError(f"run folder {self.path} {state}: it has no {DEFORMATION}")
+        history = read_json(self.path / HISTORY, "history") if (self.path / HISTORY).is_file() else []
+        content = read_json(path, "deformation")
+        try:
+            return result_from_dict(content, history=history)
+        except ValueError as error:
+            raise ValueError(f"deformation file {path}: {' '.join(str(error).split())}") from error
+
+    def _discard(self) -> None:
+        for name in RUN_FILES:
+            (self.path / name).unlink(missing_ok=True)
+
+
+def read_run(path: str | os.PathLike[str]) -> RegistrationResult:
+    """The result of a finished registration, in float64: it warps points as the result that was written did.
+
+    Args:
+        path: the run folder.
+
+    Raises:
+        FileNotFoundError: there is no such folder, or the run in it is not finished.
+        ValueError: the files in it are damaged; the message names the file and the key.
+    """
+    if not Path(path).is_dir():
+        raise FileNotFoundError(f"run folder {path} does not exist")
+    return RunFolder(path).read_result()
+
+
+def _require_loadable(content: Any, where: str) -> None:
+    if content is None or isinstance(content, (bool, int, float, str)) or type(content) is torch.Tensor:
+        return
+    if isinstance(content, dict):
+        for key, value in content.items():
+            _require_loadable(value, f"{where}[{key!r}]")
+    elif isinstance(content, (list, tuple)):
+        for i, value in enumerate(content):
+            _require_loadable(value, f"{where}[{i}]")
+    else:
+        raise ValueError(f"a checkpoint holds tensors and plain data, but {where} is a {type(content).__name__}")

@@ -1,0 +1,115 @@
+"""A registered deformation for other programs: an ITK transform and a displacement field."""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+
+import SimpleITK as sitk
+import torch
+from torch import Tensor
+
+from torchkcreg.deformation import FreeFormDeformation
+from torchkcreg.geometry import transform_points
+from torchkcreg.io.files import atomic_path
+
+_DVF_BLOCK = 65536
+
+
+def itk_transform(implant_to_world: Tensor, deformation: FreeFormDeformation) -> sitk.CompositeTransform:
+    """The ITK transform that maps points of the implant's frame to the world: T(x) = implant_to_world(x + u(x)).
+
+    A composite of a cubic `BSplineTransform` on the control-point grid (applied first) and an `AffineTransform` with
+    the rigid pose. `TransformPoint` agrees with ours to rounding inside the grid's valid domain, control points 1 to
+    n - 2 of each axis; beyond it ITK's B-spline stops at zero, where ours goes on with the nearest group's motion.
+    Coordinates are ITK's physical ones (3 D Slicer: LPS), and as always in ITK the transform maps points from the
+    space of the *output* image: resampling a world image with it gives the image in the implant's frame.
+
+    Args:
+        implant_to_world: rigid (4, 4).
+        deformation: displacements of the control points.
+    """
+    spline = sitk.BSplineTransform(3, 3)
+    grid = deformation.grid
+    shape, spacing = [int(n) for n in grid.shape], [float(s) for s in grid.spacing]
+    frame = torch.as_tensor(grid.frame).detach().cpu().double()
+    axes = frame[:3, :3]
+    corner = transform_points(frame, torch.tensor([spacing], dtype=torch.float64))[0]  # control point (1, 1, 1)
+    spline.SetTransformDomainOrigin(corner.tolist())
+    spline.SetTransformDomainDirection(axes.flatten().tolist())
+    spline.SetTransformDomainMeshSize([n - 3 for n in shape])
+    spline.SetTransformDomainPhysicalDimensions([(n - 3) * s for n, s in zip(shape, spacing)])
+    in_implant_axes = deformation.control_points.detach().cpu().double() @ axes.mT
+    spline.SetParameters(in_implant_axes.permute(3, 2, 1, 0).flatten().tolist())  # component by component, x fastest
+
+    pose = implant_to_world.detach().cpu().double()
+    rigid = sitk.AffineTransform(3)
+    rigid.SetMatrix(pose[:3, :3].flatten().tolist())
+    rigid.SetTranslation(pose[:3, 3].tolist())
+    return sitk.CompositeTransform([rigid, spline])  # ITK applies the last one first
+
+
+def write_itk_transform(
+    path: str | os.PathLike[str], implant_to_world: Tensor, deformation: FreeFormDeformation
+) -> None:
+    """Nothing; writes `itk_transform` as a .tfm that SimpleITK, ITK and 3D Slicer read."""
+    with atomic_path(path) as temporary:
+        sitk.WriteTransform(itk_transform(implant_to_world, deformation), str(temporary))
+
+
+def displacement_field(
+    implant_to_world: Tensor, deformation: FreeFormDeformation, *, spacing_mm: float = 2.0, margin_mm: float = 15.0
+) -> sitk.Image:
+    """The displacement field T(x) - x as a vector image over the implant's frame, in mm.
+
+    The image lies along the axes of the control-point grid and covers its valid domain plus a margin. Its voxel
+    positions are x in the implant's frame and its vectors lead to the world, T(x) = x + field(x): where the implant was
+    modelled in its place (implant frame = world) that is its motion; where it comes from a CAD frame the change of
+    frame is in it. Every voxel has what `warp` gives there, also beyond the valid domain.
+
+    Args:
+        implant_to_world: rigid (4, 4).
+        deformation: displacements of the control points.
+        spacing_mm: largest voxel size.
+        margin_mm: how far the image reaches beyond the valid domain.
+
+    Returns:
+        Image of float32 vectors; its index runs along the grid's axes.
+    """
+    grid = deformation.grid
+    frame = torch.as_tensor(grid.frame).detach().cpu().double()
+    starts, steps, counts = [], [], []
+    for n, control_spacing in zip(grid.shape, grid.spacing):
+        length = (int(n) - 3) * float(control_spacing) + 2 * margin_mm
+        count = max(2, math.ceil(length / spacing_mm) + 1)
+        starts.append(float(control_spacing) - margin_mm)
+        steps.append(length / (count - 1))
+        counts.append(count)
+    x, y, z = (
+        start + step * torch.arange(count, dtype=torch.float64) for start, step, count in zip(starts, steps, counts)
+    )
+    in_grid = torch.stack(torch.meshgrid(z, y, x, indexing="ij"), dim=-1).flip(-1).reshape(-1, 3)
+    points = transform_points(frame, in_grid)
+    vectors = warp(implant_to_world, deformation, points) - points
+    image = sitk.GetImageFromArray(vectors.float().reshape(*reversed(counts), 3).numpy(), isVector=True)
+    image.SetOrigin(transform_points(frame, torch.tensor([starts], dtype=torch.float64))[0].tolist())
+    image.SetSpacing(steps)
+    image.SetDirection(frame[:3, :3].flatten().tolist())
+    return image
+
+
+def write_displacement_field(
+    path: str | os.PathLike[str], implant_to_world: Tensor, deformation: FreeFormDeformation
+) -> None:
+    """Nothing; writes `displacement_field` as an image (.mha, .nrrd), compressed."""
+    with atomic_path(path) as temporary:
+        sitk.WriteImage(displacement_field(implant_to_world, deformation), str(temporary), useCompression=True)
+
+
+@torch.no_grad()
+def warp(implant_to_world: Tensor, deformation: FreeFormDeformation, points: Tensor) -> Tensor:
+    """World positions (N, 3) float64 of points (N, 3) of the implant's frame: implant_to_world(x + u(x))."""
+    exact = copy.deepcopy(deformation).cpu().double()
+    blocks = points.detach().cpu().double().split(_DVF_BLOCK)
+    return torch.cat([transform_points(implant_to_world.detach().cpu().double(), exact(block)) for block in blocks])

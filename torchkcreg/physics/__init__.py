@@ -1,0 +1,25 @@
+"""Materials, spectra, intensity models and the detector: what turns path lengths in mm into measured line integrals."""
+
+from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
+from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
+from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission
+from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
+from torchkcreg.physics.spectra import Spectrum, tungsten_spectrum
+from torchkcreg.physics.transmission import polyenergetic_line_integrals
+
+__all__ = [
+    "COUNT_FLOOR",
+    "IdentityIntensity",
+    "Material",
+    "PolyenergeticTransmission",
+    "Spectrum",
+    "calcium_in_water",
+    "gaussian_blur",
+    "gaussian_kernel",
+    "line_integrals_from_intensity",
+    "material",
+    "material_names",
+    "mixture",
+    "polyenergetic_line_integrals",
+    "tungsten_spectrum",
+]

@@ -1,0 +1,89 @@
+"""Separable Gaussian blur of images, its kernel and its adjoint."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+NUM_SIGMAS = 4.5
+SMALLEST_SIGMA = 1e-3
+
+
+def gaussian_kernel(sigma_px: Tensor) -> Tensor:
+    """Gaussian samples at -R..R, summing to one: shape `(..., 2R + 1)` for sigmas `(...)`.
+
+    R reaches 4.5 of the largest sigma (the tail beyond is 1e-5), so a step in R moves nothing that counts.
+    Differentiable in sigma; a sigma of zero gives the identity, and a zero gradient.
+    """
+    sigma = sigma_px.abs().clamp_min(SMALLEST_SIGMA)
+    largest = float(sigma.detach().max())
+    radius = math.ceil(NUM_SIGMAS * largest) if largest > 0.05 else 0
+    offsets = torch.arange(-radius, radius + 1, dtype=sigma.dtype, device=sigma.device)
+    samples = torch.exp(-0.5 * (offsets / sigma[..., None]) ** 2)
+    return samples / samples.sum(-1, keepdim=True)
+
+
+def gaussian_blur(images: Tensor, sigma_px: Tensor | float) -> Tensor:
+    """Images `(..., rows, cols)` blurred by a Gaussian; beyond the border they go on as their last pixels.
+
+    Args:
+        images: Images.
+        sigma_px: Standard deviation in pixels, the same in both directions; one number for all.
+    """
+    sigma = torch.as_tensor(sigma_px, dtype=images.dtype, device=images.device)
+    kernel = gaussian_kernel(sigma).tolist()
+    return convolve(convolve(images, kernel, -2), kernel, -1)
+
+
+def convolve(images: Tensor, kernel: list[float], dim: int) -> Tensor:
+    """Images correlated with an odd kernel along one of their last two dimensions, the border repeated."""
+    radius, size = len(kernel) // 2, images.shape[dim]
+    if radius == 0:
+        return images * kernel[0]
+    padded = _repeat_border(images, radius, dim)
+    result = padded.narrow(dim, radius, size) * kernel[radius]
+    for offset in range(len(kernel)):
+        if offset != radius:
+            result = _add_scaled(result, padded.narrow(dim, offset, size), kernel[offset])
+    return result
+
+
+def convolve_adjoint(images: Tensor, kernel: list[float], dim: int) -> Tensor:
+    """The adjoint of `convolve`: `<convolve(x), y> = <x, convolve_adjoint(y)>`."""
+    radius, size = len(kernel) // 2, images.shape[dim]
+    if radius == 0:
+        return images * kernel[0]
+    shape = list(images.shape)
+    shape[dim] += 2 * radius
+    spread = images.new_zeros(shape)
+    for offset, value in enumerate(kernel):
+        spread.narrow(dim, offset, size).add_(images, alpha=value)
+    result = spread.narrow(dim, radius, size).clone()
+    result.narrow(dim, 0, 1).add_(spread.narrow(dim, 0, radius).sum(dim, keepdim=True))
+    result.narrow(dim, size - 1, 1).add_(spread.narrow(dim, radius + size, radius).sum(dim, keepdim=True))
+    return result
+
+
+def kernel_gradient(images: Tensor, upstream: Tensor, radius: int, dim: int) -> list[float]:
+    """Derivative of `<convolve(images, kernel), upstream>` to each value of the kernel."""
+    padded = _repeat_border(images, radius, dim) if radius else images
+    size = images.shape[dim]
+    return [float((padded.narrow(dim, offset, size) * upstream).sum()) for offset in range(2 * radius + 1)]
+
+
+def _repeat_border(images: Tensor, radius: int, dim: int) -> Tensor:
+    """Images with `radius` copies of their first and last line along a dimension."""
+    sides = (0, 0, radius, radius) if dim == -2 else (radius, radius, 0, 0)
+    flat = images.reshape(-1, 1, *images.shape[-2:])
+    padded = pad(flat, sides, mode="replicate")
+    return padded.reshape(*images.shape[:-2], *padded.shape[-2:])
+
+
+def _add_scaled(total: Tensor, term: Tensor, scale: float) -> Tensor:
+    """`total + scale * term`, in place where autograd does not look."""
+    if total.requires_grad:
+        return total.add(term, alpha=scale)
+    return total.add_(term, alpha=scale)

@@ -1,0 +1,142 @@
+"""Intensity models: what stands between path lengths in mm and the line integrals that a detector reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchkcreg.physics.blur import gaussian_kernel
+from torchkcreg.physics.materials import Material, material
+from torchkcreg.physics.spectra import Spectrum
+from torchkcreg.physics.transmission import polyenergetic_line_integrals
+
+
+class IdentityIntensity(nn.Module):
+    """Path lengths as they are, summed over the materials: the model of Cao et al. 2020."""
+
+    def forward(self, path_lengths: Tensor) -> Tensor:
+        """Summed path lengths `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)`."""
+        _check_path_lengths(path_lengths, None)
+        return path_lengths[..., 0, :, :, :] if path_lengths.shape[-4] == 1 else path_lengths.sum(-4)
+
+
+class PolyenergeticTransmission(nn.Module):
+    """Line integrals behind several materials, with beam hardening, the system's blur and a scatter floor.
+
+    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`; zero where nothing stands in the beam. The blur
+    acts on intensities, before the logarithm, as it does in the detector; with hardening it moves apparent edges.
+
+    Args:
+        materials: The materials, in the order of the path lengths' M.
+        spectrum: The detected spectrum. It is reduced to the fewest energies that transmit alike.
+        scatter: Smooth scatter in units of the open beam, s.
+        blur_sigma_px: Standard deviation of the system's point spread, pixels.
+        hardness: Filtration added to the spectrum (taken away where negative), mm of aluminium:
+            `w_k *= exp(-mu_Al(E_k) hardness)`, normalised again.
+        num_bins: The most energies kept; None keeps the spectrum's own.
+
+    Attributes:
+        scatter, blur_sigma_px, hardness: Scalar parameters, float64, which a fit may move. The gradient to
+            `blur_sigma_px` vanishes at zero: start a fit of it from a third of a pixel or more.
+        energies_kev, weights, attenuation: Buffers: the energies kept `(B,)`, their weights `(B,)`, and the materials'
+            attenuation `(M, B)` in 1/mm.
+
+    Raises:
+        ValueError: If there are no materials, or scatter or blur are negative.
+
+    >>> from torchkcreg.physics import material, tungsten_spectrum
+    >>> model = PolyenergeticTransmission([material("steel")], tungsten_spectrum(90), scatter=0.05)
+    >>> lengths = torch.tensor([0.0, 1.0, 10.0]).reshape(1, 1, 1, 3)
+    >>> model(lengths).shape
+    torch.Size([1, 1, 3])
+    """
+
+    energies_kev: Tensor
+    weights: Tensor
+    attenuation: Tensor
+    aluminium: Tensor
+
+    def __init__(
+        self,
+        materials: Sequence[Material],
+        spectrum: Spectrum,
+        *,
+        scatter: float = 0.0,
+        blur_sigma_px: float = 0.0,
+        hardness: float = 0.0,
+        num_bins: int | None = 20,
+    ) -> None:
+        super().__init__()
+        if not materials:
+            raise ValueError("materials must hold at least one material, got none")
+        for name, value in (("scatter", scatter), ("blur_sigma_px", blur_sigma_px)):
+            if not value >= 0:
+                raise ValueError(f"{name} must not be negative, got {value}")
+        kept = spectrum if num_bins is None else spectrum.reduced(materials, num_bins)
+        self.material_names = tuple(m.name for m in materials)
+        self.scatter = _parameter(scatter)
+        self.blur_sigma_px = _parameter(blur_sigma_px)
+        self.hardness = _parameter(hardness)
+        self.register_buffer("energies_kev", torch.tensor(kept.energies_kev, dtype=torch.float64))
+        self.register_buffer("weights", torch.tensor(kept.weights, dtype=torch.float64))
+        self.register_buffer("attenuation", torch.stack([m.attenuation(kept.energies_kev) for m in materials]))
+        self.register_buffer("aluminium", material("aluminium").attenuation(kept.energies_kev))
+
+    def forward(
+        self,
+        path_lengths: Tensor,
+        *,
+        scatter: Tensor | None = None,
+        blur_sigma_px: Tensor | None = None,
+        hardness: Tensor | None = None,
+    ) -> Tensor:
+        """Line integrals `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)` in mm.
+
+        Args:
+            path_lengths: Path lengths, one image a material and view, any leading candidate axes.
+            scatter: Per candidate, in place of the module's own: a scalar or of the shape of the candidate axes.
+            blur_sigma_px: As `scatter`.
+            hardness: As `scatter`.
+
+        Raises:
+            ValueError: If the path lengths' M is not the number of materials, or an override fits no candidate axis.
+        """
+        _check_path_lengths(path_lengths, len(self.attenuation))
+        leading = path_lengths.shape[:-4]
+        # the few numbers a candidate in the module's own precision; the images in theirs
+        hardness = _per_candidate("hardness", self.hardness, hardness, leading)
+        sigma = _per_candidate("blur_sigma_px", self.blur_sigma_px, blur_sigma_px, leading)
+        floor = _per_candidate("scatter", self.scatter, scatter, leading)
+        weights = torch.softmax(self.weights.log() - hardness[:, None] * self.aluminium, dim=-1)
+        flat = path_lengths.reshape(-1, *path_lengths.shape[-4:])
+        result = polyenergetic_line_integrals(flat, self.attenuation, weights, gaussian_kernel(sigma), floor)
+        return result.reshape(*leading, *path_lengths.shape[-3:])
+
+    def extra_repr(self) -> str:
+        """Materials and number of energies."""
+        return f"materials={', '.join(self.material_names)}, num_bins={len(self.weights)}"
+
+
+def _parameter(value: float) -> nn.Parameter:
+    """A scalar float64 parameter."""
+    return nn.Parameter(torch.tensor(float(value), dtype=torch.float64))
+
+
+def _check_path_lengths(path_lengths: Tensor, num_materials: int | None) -> None:
+    """Raise ValueError unless the path lengths have the shape (..., M, V, rows, cols)."""
+    if path_lengths.dim() < 4 or num_materials not in (None, path_lengths.shape[-4]):
+        expected = "M" if num_materials is None else num_materials
+        raise ValueError(
+            f"path_lengths must have shape (..., {expected}, V, rows, cols), got {tuple(path_lengths.shape)}"
+        )
+
+
+def _per_candidate(name: str, own: Tensor, override: Tensor | None, leading: torch.Size) -> Tensor:
+    """The value of each candidate, flat: the override's where given, else the module's own."""
+    value = own if override is None else torch.as_tensor(override, dtype=own.dtype, device=own.device)
+    try:
+        return value.broadcast_to(leading).reshape(-1)
+    except RuntimeError as error:
+        raise ValueError(f"{name} must fit the candidates {tuple(leading)}, got {tuple(value.shape)}") from error

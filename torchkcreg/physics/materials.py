@@ -1,0 +1,196 @@
+"""Attenuation of the usual alloys, tissues and phantom materials, from packaged tables of 10 to 150 keV."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import resources
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+ALIASES = {
+    "316l": "steel",
+    "stainless_steel": "steel",
+    "ti6al4v": "titanium",
+    "ti-6al-4v": "titanium",
+    "cocrmo": "cocr",
+    "aluminum": "aluminium",
+    "bone": "cortical_bone",
+    "trabecular_bone": "cancellous_bone",
+    "fat": "adipose_tissue",
+    "uhmwpe": "polyethylene",
+}
+
+
+@dataclass(frozen=True)
+class Material:
+    """A homogeneous material: density and a table of total mass attenuation.
+
+    Attributes:
+        name: Name for messages and labels.
+        density_g_cm3: Density, g/cm^3.
+        energies_kev: Rising energies, keV. An energy that stands twice is an absorption edge: below it, above it.
+        mass_attenuation_cm2_g: Total mass attenuation coefficient at these energies, cm^2/g.
+
+    Raises:
+        ValueError: If the density is not positive or the table is not one of rising energies and positive values.
+
+    >>> round(float(material("water").attenuation(60.0)), 5)
+    0.02059
+    """
+
+    name: str
+    density_g_cm3: float
+    energies_kev: tuple[float, ...]
+    mass_attenuation_cm2_g: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        energies, values = self.energies_kev, self.mass_attenuation_cm2_g
+        if not self.density_g_cm3 > 0:
+            raise ValueError(f"density of {self.name} must be positive, got {self.density_g_cm3}")
+        if len(energies) != len(values) or len(energies) < 2:
+            raise ValueError(f"table of {self.name} must pair 2 or more values, got {len(energies)} and {len(values)}")
+        if min(values) <= 0 or any(b < a for a, b in pairwise(energies)):
+            raise ValueError(f"table of {self.name} must have rising energies and positive values")
+
+    def attenuation(self, energies_kev: Tensor | np.ndarray | Sequence[float] | float) -> Tensor:
+        """Linear attenuation coefficient in 1/mm, float64, of the shape of the energies.
+
+        Interpolated linearly in the logarithms of energy and attenuation, never across an absorption edge (an edge's
+        own energy belongs to the side above it).
+
+        Args:
+            energies_kev: Energies, keV, any shape, inside the table.
+
+        Raises:
+            ValueError: If an energy lies outside the table.
+        """
+        asked = torch.as_tensor(energies_kev, dtype=torch.float64)
+        table = torch.tensor(self.energies_kev, dtype=torch.float64, device=asked.device)
+        if asked.numel() and not bool(((asked >= table[0]) & (asked <= table[-1])).all()):
+            low, high = float(asked.min()), float(asked.max())
+            span = f"{table[0]:g} to {table[-1]:g} keV"
+            raise ValueError(f"energies_kev must lie within {span} ({self.name}), got {low:g} to {high:g}")
+        values = torch.tensor(self.mass_attenuation_cm2_g, dtype=torch.float64, device=asked.device).log()
+        # right=True: an interval never starts at the first of an edge's two entries, so its width is never zero
+        lower = (torch.searchsorted(table, asked.contiguous(), right=True) - 1).clamp(0, len(table) - 2)
+        table = table.log()
+        fraction = (asked.log() - table[lower]) / (table[lower + 1] - table[lower])
+        mass_attenuation = torch.lerp(values[lower], values[lower + 1], fraction).exp()
+        return mass_attenuation * (self.density_g_cm3 / 10)
+
+    def with_density(self, density_g_cm3: float) -> Material:
+        """The same substance at another density, g/cm^3 (a porous bone, a needle scintillator)."""
+        return replace(self, density_g_cm3=float(density_g_cm3))
+
+
+def material(name: str, *, density: float | None = None) -> Material:
+    """A packaged material by name, upper or lower case, at its usual density or at `density` g/cm^3.
+
+    Among others `steel` (316L, 7.95 g/cm^3), `titanium` (Ti-6Al-4V, 4.43), `cocr` (ASTM F75, 8.3), `aluminium`,
+    `copper`, `water`, `soft_tissue`, `cortical_bone` (ICRU 44, 1.92), `cancellous_bone`, `pmma`, `csi`; all of them in
+    `material_names()`.
+
+    Raises:
+        ValueError: If there is no such material; the message lists those there are.
+
+    >>> material("steel").density_g_cm3, material("Ti-6Al-4V").name
+    (7.95, 'titanium')
+    """
+    key = name.strip().lower().replace(" ", "_")
+    key = ALIASES.get(key, key)
+    if key not in material_names():
+        raise ValueError(f"material must be one of {', '.join(material_names())}, got {name!r}")
+    found = _packaged_material(key)
+    return found if density is None else found.with_density(density)
+
+
+def material_names() -> tuple[str, ...]:
+    """Names of the packaged materials, without their aliases."""
+    return tuple(_compositions())
+
+
+def mixture(name: str, parts: Mapping[str, float], *, density: float) -> Material:
+    """A mixture of packaged materials by mass.
+
+    Args:
+        name: Name of the mixture.
+        parts: Mass of each packaged material, in any one unit; fractions are formed here.
+        density: Density of the mixture, g/cm^3.
+
+    Raises:
+        ValueError: If the masses are not all positive, or a material is unknown.
+
+    >>> mixture("contrast", {"water": 0.98, "iodine": 0.02}, density=1.02).name
+    'contrast'
+    """
+    if not parts or min(parts.values()) <= 0:
+        raise ValueError(f"parts must be positive masses, got {dict(parts)}")
+    found = [material(part) for part in parts]
+    masses = np.array(list(parts.values()), dtype=float)
+    table = np.array([part.mass_attenuation_cm2_g for part in found])
+    return Material(name, float(density), found[0].energies_kev, tuple((masses / masses.sum()) @ table))
+
+
+def calcium_in_water(concentration_mg_ml: float) -> Material:
+    """Calcium dissolved in water, as in calibration rods: its attenuation is that of water plus that of the calcium.
+
+    The calcium adds to the mass and takes no room: the density is 1 + concentration/1000 g/cm^3.
+
+    Args:
+        concentration_mg_ml: Calcium per volume, mg/mL; zero is water.
+
+    Raises:
+        ValueError: If the concentration is negative.
+
+    >>> calcium_in_water(100).density_g_cm3
+    1.1
+    """
+    if not concentration_mg_ml >= 0:
+        raise ValueError(f"concentration_mg_ml must not be negative, got {concentration_mg_ml}")
+    if concentration_mg_ml == 0:
+        return material("water")
+    calcium = concentration_mg_ml / 1000
+    name = f"calcium_{concentration_mg_ml:g}_mg_ml"
+    return mixture(name, {"water": 1.0, "calcium": calcium}, density=1.0 + calcium)
+
+
+def packaged_rows(file_name: str) -> Iterator[list[str]]:
+    """Rows of a packaged table, its comment lines left out."""
+    text = (resources.files("torchkcreg.physics") / "data" / file_name).read_text(encoding="utf-8")
+    return csv.reader(line for line in text.splitlines() if not line.startswith("#"))
+
+
+@cache
+def _compositions() -> dict[str, tuple[float, dict[str, float]]]:
+    """Density and mass fractions of the elements of each packaged material."""
+    found = {}
+    for name, density, fractions, _source in packaged_rows("materials.csv"):
+        pairs = (pair.split(":") for pair in fractions.split())
+        found[name] = (float(density), {symbol: float(fraction) for symbol, fraction in pairs})
+    return found
+
+
+@cache
+def _element_table() -> tuple[tuple[float, ...], dict[str, np.ndarray]]:
+    """Energies in keV and the mass attenuation of each element, cm^2/g."""
+    header, *rows = packaged_rows("elements.csv")
+    table = np.array(rows, dtype=float)
+    return tuple(table[:, 0]), {symbol: table[:, column] for column, symbol in enumerate(header[1:], start=1)}
+
+
+@cache
+def _packaged_material(name: str) -> Material:
+    """The packaged material of exactly this name."""
+    density, fractions = _compositions()[name]
+    energies, elements = _element_table()
+    total = sum(fractions.values())
+    values = sum(
+        (fraction / total * elements[symbol] for symbol, fraction in fractions.items()), np.zeros(len(energies))
+    )
+    return Material(name, density, energies, tuple(values))

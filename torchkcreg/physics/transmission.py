@@ -1,0 +1,137 @@
+"""Line integrals that a detector reports behind several materials: one fused operation with its own derivatives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from torchkcreg.physics.blur import convolve, convolve_adjoint, kernel_gradient
+
+BLOCK_PIXELS = 65536  # exponentials are taken in blocks that stay in a core's cache
+
+
+def polyenergetic_line_integrals(
+    path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor
+) -> Tensor:
+    """Line integrals `(K, V, rows, cols)` of materials' path lengths `(K, M, V, rows, cols)`.
+
+    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`, candidate by candidate; only images of the size of
+    the result are kept for the gradient, whatever the number of energies.
+
+    Args:
+        path_lengths: Path lengths in mm, `(K, M, V, rows, cols)`.
+        attenuation: Attenuation coefficients in 1/mm, `(M, energies)`; no gradient.
+        weights: Weights of the energies, `(K, energies)`.
+        kernel: One-dimensional blur kernels, `(K, odd)`, applied along rows and columns.
+        scatter: Scatter floors in units of the open beam, `(K,)`.
+
+    Returns:
+        Differentiable once, in everything but the attenuation.
+    """
+    return _PolyenergeticLineIntegrals.apply(path_lengths, attenuation, weights, kernel, scatter)
+
+
+class _PolyenergeticLineIntegrals(torch.autograd.Function):
+    """See `polyenergetic_line_integrals`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor
+    ) -> Tensor:
+        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter)
+        coefficients = attenuation.tolist()
+        num_candidates, _, *image_shape = path_lengths.shape
+        result = path_lengths.new_empty(num_candidates, *image_shape)
+        settings = zip(weights.tolist(), kernel.tolist(), scatter.tolist())
+        for candidate, (shares, blur, floor) in enumerate(settings):
+            lengths = path_lengths[candidate].flatten(1)
+            signal = transmitted(lengths, coefficients, shares).view(image_shape)
+            for view in range(image_shape[0]):
+                blurred = convolve(convolve(signal[view], blur, -2), blur, -1)
+                out = result[candidate, view]
+                _add_floor(blurred, floor, out=out).log_().neg_().add_(_log1p(floor))
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        path_lengths, attenuation, weights, kernel, scatter = ctx.saved_tensors
+        coefficients = attenuation.tolist()
+        wants_lengths, _, wants_weights, wants_kernel, wants_scatter = ctx.needs_input_grad
+        grad_lengths = torch.empty_like(path_lengths) if wants_lengths else None
+        grad_weights, grad_kernel, grad_scatter = [], [], []
+        settings = zip(weights.tolist(), kernel.tolist(), scatter.tolist())
+        for candidate, (shares, blur, floor) in enumerate(settings):
+            lengths = path_lengths[candidate].flatten(1)
+            signal = transmitted(lengths, coefficients, shares).view(path_lengths.shape[2:])
+            along_rows = convolve(signal, blur, -2)
+            blurred = convolve(along_rows, blur, -1)
+            grad_signal = _add_floor(blurred, floor, out=blurred).reciprocal_().mul_(upstream[candidate]).neg_()
+            if wants_scatter:
+                grad_scatter.append(float(grad_signal.sum()) + float(upstream[candidate].sum()) / (1 + floor))
+            grad_rows = convolve_adjoint(grad_signal, blur, -1)
+            if wants_kernel:
+                radius = len(blur) // 2
+                first = kernel_gradient(signal, grad_rows, radius, -2)
+                second = kernel_gradient(along_rows, grad_signal, radius, -1)
+                grad_kernel.append([a + b for a, b in zip(first, second)])
+            grad_signal = convolve_adjoint(grad_rows, blur, -2).flatten()
+            out = grad_lengths[candidate].flatten(1) if grad_lengths is not None else None
+            grad_weights.append(_transmission_gradient(lengths, coefficients, shares, grad_signal, out))
+        return (
+            grad_lengths,
+            None,
+            weights.new_tensor(grad_weights) if wants_weights else None,
+            kernel.new_tensor(grad_kernel) if wants_kernel else None,
+            scatter.new_tensor(grad_scatter) if wants_scatter else None,
+        )
+
+
+def transmitted(lengths: Tensor, attenuation: list[list[float]], weights: list[float]) -> Tensor:
+    """Transmitted signal `(pixels,)`, `sum_k w_k exp(-sum_m mu_mk L_m)`, of path lengths `(M, pixels)` in mm."""
+    result = lengths.new_zeros(lengths.shape[1])
+    for start in range(0, len(result), BLOCK_PIXELS):
+        block = lengths[:, start : start + BLOCK_PIXELS]
+        total = result[start : start + BLOCK_PIXELS]
+        for energy, weight in enumerate(weights):
+            total.add_(_attenuated(block, attenuation, energy), alpha=weight)
+    return result
+
+
+def _attenuated(block: Tensor, attenuation: list[list[float]], energy: int) -> Tensor:
+    """`exp(-sum_m mu_m L_m)` at one energy."""
+    exponent = block[0] * -attenuation[0][energy]
+    for material in range(1, len(block)):
+        exponent.add_(block[material], alpha=-attenuation[material][energy])
+    return exponent.exp_()
+
+
+def _transmission_gradient(
+    lengths: Tensor, attenuation: list[list[float]], weights: list[float], upstream: Tensor, out: Tensor | None
+) -> list[float]:
+    """Derivatives of `<transmitted, upstream>` to the weights; those to the path lengths go into `out`."""
+    grad_weights = [0.0] * len(weights)
+    if out is not None:
+        out.zero_()
+    for start in range(0, lengths.shape[1], BLOCK_PIXELS):
+        stop = start + BLOCK_PIXELS
+        for energy, weight in enumerate(weights):
+            passed = _attenuated(lengths[:, start:stop], attenuation, energy).mul_(upstream[start:stop])
+            grad_weights[energy] += float(passed.sum())
+            if out is not None:
+                for material, coefficients in enumerate(attenuation):
+                    out[material, start:stop].add_(passed, alpha=-weight * coefficients[energy])
+    return grad_weights
+
+
+def _add_floor(signal: Tensor, floor: float, *, out: Tensor) -> Tensor:
+    """Signal plus floor, kept positive: a negative floor must not turn into NaN."""
+    return torch.add(signal, floor, out=out).clamp_min_(torch.finfo(signal.dtype).tiny)
+
+
+def _log1p(floor: float) -> float:
+    """`ln(1 + floor)` as a number."""
+    return float(torch.log1p(torch.tensor(floor, dtype=torch.float64)))

@@ -1,0 +1,63 @@
+"""Finds, or builds at first use, the library of compiled kernels."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from pathlib import Path
+
+import torch
+
+PACKAGE = Path(__file__).resolve().parent.parent
+SOURCES = ("csrc/ops.cpp", "csrc/cpu/point_drr.cpp")
+# setup.py reads these too. The target version lets one build serve torch 2.10 and every later release.
+DEFINES = ("-DTORCH_TARGET_VERSION=0x020a000000000000",)
+COMPILE_FLAGS = ("-O3", "-std=c++17", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-Wno-psabi")
+
+
+@functools.lru_cache(maxsize=1)
+def unavailable_reason() -> str | None:
+    """None where the compiled kernels are loaded, else why they are not. The first call loads, or compiles, them.
+
+    A library built with the package is taken first. Without one, or where it does not load (another torch, another
+    machine), the sources are compiled into the user's cache of torch extensions. Where that fails too, a warning says
+    how to fix it, once, and the torch reference does the work.
+    """
+    reasons = []
+    for load in (_load_built, _load_compiled):
+        try:
+            load()
+            return None
+        except Exception as error:  # whatever the loader, compiler or cache throws, there is a reference to fall back on
+            lines = str(error).strip().splitlines() or [type(error).__name__]
+            reasons.append(lines[0])
+    reason = "; ".join(reasons)
+    warnings.warn(
+        f"torchkcreg runs on its slow torch reference, because its C++ kernels are not available ({reason}). Install a "
+        "C++17 compiler and ninja, then reinstall with: pip install --no-build-isolation --force-reinstall --no-deps "
+        "torchkcreg",
+        stacklevel=2,
+    )
+    return reason
+
+
+def _load_built() -> None:
+    for library in sorted(PACKAGE.glob("_C*.so")) + sorted(PACKAGE.glob("_C*.pyd")):
+        torch.ops.load_library(str(library))
+        return
+    raise FileNotFoundError(f"no built library in {PACKAGE}")
+
+
+def _load_compiled() -> None:
+    from torch.utils import cpp_extension  # slow to import, and seldom needed
+
+    sources = [PACKAGE / source for source in SOURCES]
+    missing = [str(source) for source in sources if not source.is_file()]
+    if missing:
+        raise FileNotFoundError(f"no source {missing[0]}")
+    cpp_extension.load(
+        "torchkcreg_kernels",
+        [str(source) for source in sources],
+        extra_cflags=[*COMPILE_FLAGS, *DEFINES],
+        is_python_module=False,
+    )

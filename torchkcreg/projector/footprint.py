@@ -1,0 +1,175 @@
+"""The image of one node: its projected cell, averaged over a pixel."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_NODES_PER_CENTROID = 32  # a block's centroid only has to be right within a millimetre or so
+_MAX_TAPS = 64
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Tabulated images of a node, one table for each view and each block of consecutive nodes.
+
+    Args:
+        table: shape (V, num_blocks, R + 1, R + 1, T, T). Entry ``[view, block, pv, pu]`` holds the T x T pixel values
+            of a node of mass 1 that sits ``pv / R`` and ``pu / R`` of a pixel beyond the pixel of tap ``T / 2 - 1``.
+            The T x T taps sum to one at every phase.
+        block_size: how many consecutive nodes share a table; the last block may be shorter.
+    """
+
+    table: Tensor
+    block_size: int
+
+    @property
+    def taps(self) -> int:
+        """Width T of the footprint in pixels."""
+        return self.table.shape[-1]
+
+    @property
+    def phases(self) -> int:
+        """Number R of sub-pixel positions that are tabulated along each axis."""
+        return self.table.shape[2] - 1
+
+    @property
+    def num_blocks(self) -> int:
+        """Number of blocks of nodes."""
+        return self.table.shape[1]
+
+
+@torch.no_grad()
+def cell_footprint(
+    points: Tensor,  # (..., N, 3)
+    cell: Tensor,  # (3, 3) or (num_blocks, 3, 3)
+    projection_matrices: Tensor,  # (V, 3, 4)
+    *,
+    block_size: int = 8192,
+    phases: int = 16,
+) -> Footprint:
+    """Footprint of the nodes of a lattice: the projection of their cell, box-filtered by the pixel.
+
+    Near a block's centroid a projection is affine, and takes the edges ``a_i`` of the cell to ``e_i = J a_i`` pixels. The
+    image of a homogeneous cell is then the box spline of ``e_1, e_2, e_3``, and its average over a pixel has the Fourier
+    transform ``prod_i sinc(f . e_i) * sinc(f_u) sinc(f_v)`` with f in cycles per pixel. Sampled at multiples of ``1 / T``
+    and transformed back it gives the footprint at ``1 / R`` of a pixel. A box of ``2 / R`` pixels (Lanczos' sigma factors)
+    keeps the truncated series from ringing where cells are much smaller than pixels. Cells that tile space have
+    footprints that tile the image: no stripes.
+
+    Args:
+        points: nodes in world mm, shape (..., N, 3). Leading axes (candidates) are averaged.
+        cell: edge vectors of a node's cell in world mm, one in each row; or one such matrix for each block.
+        projection_matrices: shape (V, 3, 4), world mm to homogeneous pixels.
+        block_size: how many consecutive nodes share a table. Consecutive nodes should be neighbours in space.
+        phases: number R of tabulated sub-pixel positions along each axis.
+
+    Returns:
+        The footprint, in the dtype and on the device of the points, without gradient.
+
+    Raises:
+        ValueError: where shapes don't fit, or cells project to more than 64 pixels.
+
+    >>> P = torch.tensor([[[1000.0, 0, 0, 0], [0, 1000, 0, 0], [0, 0, 1, 500]]])
+    >>> footprint = cell_footprint(torch.zeros(5, 3), 0.25 * torch.eye(3), P)
+    >>> footprint.table.shape
+    torch.Size([1, 1, 17, 17, 4, 4])
+    """
+    _check(points, cell, projection_matrices, block_size, phases)
+    matrices = projection_matrices.to(points)
+    centroids = _block_centroids(points, block_size)
+    edges = _projected_edges(centroids, cell.to(points), matrices)
+    taps = _num_taps(edges, phases)
+    table = _tabulate(edges.flatten(0, 1), taps, phases)
+    return Footprint(table.reshape(len(matrices), len(centroids), *table.shape[1:]), block_size)
+
+
+def _check(points: Tensor, cell: Tensor, matrices: Tensor, block_size: int, phases: int) -> None:
+    if points.dim() < 2 or points.shape[-1] != 3 or points.shape[-2] == 0:
+        raise ValueError(f"points must have shape (..., N, 3) with N > 0, got {tuple(points.shape)}")
+    if matrices.dim() != 3 or matrices.shape[1:] != (3, 4):
+        raise ValueError(f"projection_matrices must have shape (V, 3, 4), got {tuple(matrices.shape)}")
+    if block_size < 1:
+        raise ValueError(f"block_size must be positive, got {block_size}")
+    if phases < 2 or phases % 2:
+        raise ValueError(f"phases must be an even number, got {phases}")
+    num_blocks = math.ceil(points.shape[-2] / block_size)
+    if tuple(cell.shape) not in ((3, 3), (num_blocks, 3, 3)):
+        raise ValueError(f"cell must have shape (3, 3) or ({num_blocks}, 3, 3), got {tuple(cell.shape)}")
+    if not torch.isfinite(cell).all():
+        raise ValueError("cell must be finite")
+
+
+def _block_centroids(points: Tensor, block_size: int) -> Tensor:
+    """Approximate centroid (num_blocks, 3) of each block, over a few nodes of it and over all candidates."""
+    num_nodes = points.shape[-2]
+    num_samples = min(block_size, _NODES_PER_CENTROID)
+    starts = torch.arange(0, num_nodes, block_size, device=points.device)
+    lengths = (num_nodes - starts).clamp(max=block_size)
+    steps = torch.arange(num_samples, device=points.device)
+    picks = starts[:, None] + torch.div(lengths[:, None] * (2 * steps + 1), 2 * num_samples, rounding_mode="floor")
+    nodes = points.index_select(-2, picks.flatten()).reshape(-1, len(starts), num_samples, 3)
+    return nodes.movedim(1, 0).flatten(1, 2).nanmean(dim=1)
+
+
+def _projected_edges(centroids: Tensor, cell: Tensor, matrices: Tensor) -> Tensor:
+    """Cell edges in pixels (V, num_blocks, 3 edges, 2), by the Jacobian of the projection at the centroids."""
+    linear, offset = matrices[:, None, :, :3], matrices[:, None, :, 3]
+    pixels = (linear * centroids[:, None, :]).sum(-1) + offset
+    depth = pixels[..., 2:]
+    uv = pixels[..., :2] / depth
+    jacobian = (linear[..., :2, :] - uv[..., None] * linear[..., 2:, :]) / depth[..., None]
+    edges = cell @ jacobian.mT
+    # Blocks behind the source (or of NaN) are not drawn, so any footprint will do for them.
+    return torch.where((depth > 0)[..., None] & edges.isfinite(), edges, 0.0)
+
+
+def _num_taps(edges: Tensor, phases: int) -> int:
+    """The smallest of 4, 6, 8, 12, 16, 24, ... that holds the support of every footprint."""
+    width = float(edges.abs().sum(dim=2).amax()) + 1 + 2 / phases if edges.numel() else 0.0
+    taps = 4
+    while taps < width:
+        taps = taps * 3 // 2 if taps & (taps - 1) == 0 else taps * 4 // 3
+    if taps > _MAX_TAPS:
+        raise ValueError(
+            f"cell must project to at most {_MAX_TAPS} pixels, got {width:.0f}: check its unit (mm) and that no points "
+            "lie next to the source"
+        )
+    return taps
+
+
+def _tabulate(edges: Tensor, taps: int, phases: int) -> Tensor:
+    """Tables (n, R + 1, R + 1, T, T) of the footprints with projected edges (n, 3, 2)."""
+    even, odd, angle_u, angle_v = _transform(taps, phases, edges.dtype, edges.device)
+    # Footprints are symmetric about the node, so their transform F is real, and F(-f) = F(f). With f_u, f_v >= 0 and
+    # F' = F(f_u, -f_v): f(d) = sum (F + F') cos cos - (F - F') sin sin.
+    mirrored = torch.stack([edges, edges * edges.new_tensor([1.0, -1.0])], dim=1)
+    spectrum: Tensor | None = None
+    for edge in mirrored.unbind(2):
+        angle = edge[..., 1, None, None] * angle_v + edge[..., 0, None, None] * angle_u
+        angle += 1e-20  # changes nothing but a zero, where sin(x) / x is one
+        factor = torch.sin(angle).div_(angle)
+        spectrum = factor if spectrum is None else spectrum.mul_(factor)
+    plus, minus = spectrum.unbind(1)
+    half = torch.stack([plus + minus, plus - minus], dim=1) @ torch.stack([even, -odd])
+    table = torch.cat([even, odd]).mT @ half.flatten(1, 2)
+    return table.unflatten(2, (phases + 1, taps)).unflatten(1, (phases + 1, taps)).transpose(2, 3).contiguous()
+
+
+@functools.lru_cache(maxsize=8)
+def _transform(taps: int, phases: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    """Cosine and sine transforms (frequencies, (R + 1) T) along one axis, filtered; angles along u and v for sin(x) / x."""
+    frequency = torch.arange(taps * phases // 2, dtype=torch.float64, device=device) / taps
+    # Pixel box and Lanczos box; both are even, like the weight 2 of all but the zero frequency (halved: see F + F').
+    window = torch.sinc(frequency) * torch.sinc(2 * frequency / phases) / taps * math.sqrt(2)
+    window[0] /= 2
+    phase = torch.arange(phases + 1, dtype=torch.float64, device=device) / phases
+    tap = torch.arange(taps, dtype=torch.float64, device=device) - (taps // 2 - 1)
+    offset = 2 * math.pi * frequency[:, None] * (tap - phase[:, None]).flatten()
+    even, odd = window[:, None] * torch.cos(offset), window[:, None] * torch.sin(offset)
+    angle = math.pi * frequency
+    return even.to(dtype), odd.to(dtype), angle.to(dtype), angle[:, None].to(dtype)

@@ -1,0 +1,25 @@
+"""Registration: the objective, its optimisers and the coarse-to-fine loop."""
+
+from .callbacks import Callback, ProgressBar
+from .config import RegistrationConfig, Stage, preset_stages
+from .data import RegistrationData
+from .objective import StageObjective
+from .register import build_scene, register
+from .result import RegistrationResult
+from .scene import Scene
+from .trainer import Trainer
+
+__all__ = [
+    "Callback",
+    "ProgressBar",
+    "RegistrationConfig",
+    "RegistrationData",
+    "RegistrationResult",
+    "Scene",
+    "Stage",
+    "StageObjective",
+    "Trainer",
+    "build_scene",
+    "preset_stages",
+    "register",
+]

@@ -1,0 +1,117 @@
+"""Options of a registration: what is estimated, in which stages, with which optimiser."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+OptimizerName = Literal["gauss-newton", "cmaes", "adam"]
+PresetName = Literal["gauss-newton", "paper", "adam"]
+NuisanceName = Literal["scatter", "blur", "hardness"]
+
+
+class Stage(BaseModel):
+    """One level of the coarse-to-fine schedule.
+
+    Attributes:
+        groups: Number of control-point groups; one group is a rigid registration of the whole implant.
+        bin: Detector pixels are averaged in squares of this side.
+        pitch_factor: The implant's nodes are merged on a lattice this many times coarser.
+        optimizer: "gauss-newton", "cmaes" or "adam".
+        iterations: At most this many iterations (generations of CMA-ES).
+        tolerance: The stage ends when an iteration moves the implant by less, mm (CMA-ES: the spread of a generation).
+        step_mm: Initial step: CMA-ES standard deviation, Adam learning rate, largest Gauss-Newton step.
+        population: Candidates of a CMA-ES generation.
+        margin_mm: What is seen around the implant's projection, mm at the detector.
+        estimate: Parameters of the intensity model that are estimated along.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    groups: int = Field(1, ge=1, le=64)
+    bin: int = Field(1, ge=1, le=64)
+    pitch_factor: int = Field(1, ge=1, le=16)
+    optimizer: OptimizerName = "gauss-newton"
+    iterations: int = Field(20, ge=1)
+    tolerance: float = Field(0.002, gt=0)
+    step_mm: float = Field(1.0, gt=0)
+    population: int = Field(40, ge=4)
+    margin_mm: float = Field(6.0, ge=0)
+    estimate: tuple[NuisanceName, ...] = ()
+
+
+def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
+    """Stages of a named schedule.
+
+    * "gauss-newton": a coarse rigid CMA-ES start, then Gauss-Newton from one rigid group to ten groups.
+    * "paper": CMA-ES throughout, population 40, at most 400 iterations a stage, 2 to 10 groups (Cao et al. 2020).
+    * "adam": the Gauss-Newton schedule with Adam in the place of Gauss-Newton.
+    """
+    physics: tuple[NuisanceName, ...] = ("scatter", "blur")
+    start = Stage(bin=8, pitch_factor=4, optimizer="cmaes", iterations=60, tolerance=0.1, step_mm=2.0, population=16, margin_mm=25.0)
+    if preset == "paper":
+        shared = {"optimizer": "cmaes", "iterations": 400, "population": 40}
+        return (
+            start,
+            Stage(bin=4, pitch_factor=2, step_mm=0.5, tolerance=0.01, estimate=physics, **shared),
+            *(Stage(groups=g, bin=4, pitch_factor=2, step_mm=0.3, tolerance=0.01, estimate=physics, **shared) for g in (2, 4)),
+            *(Stage(groups=g, bin=2, pitch_factor=2, step_mm=0.1, tolerance=0.005, **shared) for g in (6, 8, 10)),
+        )
+    if preset == "adam":
+        shared = {"optimizer": "adam", "iterations": 150}
+        return (
+            start,
+            Stage(bin=4, pitch_factor=2, step_mm=0.1, estimate=physics, **shared),
+            *(Stage(groups=g, bin=2, pitch_factor=2, step_mm=0.05, estimate=physics, **shared) for g in (2, 5)),
+            Stage(groups=10, bin=1, step_mm=0.02, estimate=physics, **shared),
+        )
+    return (
+        start,
+        Stage(bin=4, pitch_factor=2, estimate=physics),
+        Stage(bin=2, pitch_factor=2, estimate=physics),
+        *(Stage(groups=g, bin=2, pitch_factor=2, estimate=physics) for g in (2, 5)),
+        Stage(groups=10, bin=1, estimate=physics),
+    )
+
+
+class RegistrationConfig(BaseModel):
+    """Every option of a registration but the files; unknown keys are refused.
+
+    Attributes:
+        preset: Named schedule, used when ``stages`` is empty.
+        stages: The schedule itself, see :class:`Stage`.
+        material: Name of the implant's material; None keeps plain path lengths (the paper's DRR).
+        pitch_mm: Lattice pitch of the implant's point cloud, mm.
+        grid_shape: Control points along the principal axes, shortest axis first; grown where the implant needs more.
+        grid_spacing_mm: Spacing of the control points, mm.
+        beta: Weight of the diffusion penalty (eq. 5).
+        stiffness: Weight of the elastic energy of the implant's own material.
+        scatter: Initial scatter floor, as a fraction of the open beam.
+        blur_px: Initial standard deviation of the detector's blur, pixels.
+        follow_radius_mm: A component follows the implant's nodes within this distance of its head.
+        seed: Seed of every random number.
+        backend: Projector: "auto", "cpp", "triton" or "torch".
+        device: Torch device.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    preset: PresetName = "gauss-newton"
+    stages: tuple[Stage, ...] = ()
+    material: str | None = None
+    pitch_mm: float = Field(0.25, gt=0)
+    grid_shape: tuple[int, int, int] = (6, 6, 10)
+    grid_spacing_mm: tuple[float, float, float] = (8.75, 8.75, 25.0)
+    beta: float = Field(1e-4, ge=0)
+    stiffness: float = Field(0.0, ge=0)
+    scatter: float = Field(0.05, ge=0, lt=1)
+    blur_px: float = Field(0.7, ge=0)
+    follow_radius_mm: float = Field(8.0, gt=0)
+    seed: int = 0
+    backend: Literal["auto", "cpp", "triton", "torch"] = "auto"
+    device: str = "cpu"
+
+    def schedule(self) -> tuple[Stage, ...]:
+        """The stages that will run."""
+        return self.stages or preset_stages(self.preset)

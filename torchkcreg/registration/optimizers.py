@@ -1,0 +1,142 @@
+"""Optimisers of a registration stage: CMA-ES by ask and tell, Adam and Gauss-Newton by steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import cma
+import numpy as np
+import torch
+from torch import Tensor
+
+from .config import Stage
+
+
+class Problem(Protocol):
+    """What an optimiser needs to know of a stage."""
+
+    num_parameters: int
+
+    def losses(self, candidates: Tensor) -> Tensor:
+        """Losses (K,) of candidates (K, D)."""
+
+    def loss_and_gradient(self, parameters: Tensor) -> tuple[float, Tensor]:
+        """Loss and its gradient (D,) at one vector (D,)."""
+
+    def curvature(self, parameters: Tensor) -> Tensor:
+        """Gauss-Newton approximation (D, D) of the loss's second derivatives."""
+
+    def project(self, parameters: Tensor) -> Tensor:
+        """The nearest vector inside the bounds."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State after an iteration: its number, the best loss so far and the size of the last step, mm."""
+
+    iteration: int
+    loss: float
+    step_mm: float
+
+
+Report = Callable[[Progress], None]
+
+
+def minimize(problem: Problem, stage: Stage, *, seed: int, report: Report) -> Tensor:
+    """The best parameters (D,) that the stage's optimiser finds, starting from zero."""
+    run = {"cmaes": cmaes, "adam": adam, "gauss-newton": gauss_newton}[stage.optimizer]
+    return run(problem, stage, seed, report)
+
+
+def cmaes(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:
+    """Covariance matrix adaptation evolution strategy (library ``cma``); a whole generation is one batch."""
+    options = {
+        "popsize": stage.population,
+        "maxiter": stage.iterations,
+        "seed": seed + 1,  # cma takes 0 for the clock
+        "verbose": -9,
+        "verb_log": 0,
+        "tolfun": 0.0,
+        "tolfunhist": 0.0,
+        "tolx": 0.0,
+        "tolstagnation": stage.iterations,
+    }
+    strategy = cma.CMAEvolutionStrategy(np.zeros(problem.num_parameters), stage.step_mm, options)
+    while not strategy.stop():
+        candidates = strategy.ask()
+        batch = problem.project(torch.as_tensor(np.stack(candidates), dtype=torch.float64))
+        losses = problem.losses(batch)
+        strategy.tell(candidates, losses.tolist())
+        spread = float(strategy.sigma * np.sqrt(np.mean(strategy.C.diagonal() if strategy.C.ndim == 2 else strategy.C)))
+        report(Progress(strategy.countiter, float(strategy.best.f), spread))
+        if spread < stage.tolerance:
+            break
+    return problem.project(torch.as_tensor(strategy.mean, dtype=torch.float64)[None])[0]
+
+
+def adam(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:
+    """Adam (Kingma & Ba 2015) with a cosine-shaped learning rate; returns the best vector it saw."""
+    parameters = torch.zeros(problem.num_parameters, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([parameters], lr=stage.step_mm)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, stage.iterations, eta_min=0.02 * stage.step_mm)
+    best, best_loss = parameters.detach().clone(), float("inf")
+    for iteration in range(1, stage.iterations + 1):
+        before = parameters.detach().clone()
+        loss, gradient = problem.loss_and_gradient(before)
+        if loss < best_loss:
+            best, best_loss = before, loss
+        parameters.grad = gradient
+        optimizer.step()
+        schedule.step()
+        with torch.no_grad():
+            parameters.copy_(problem.project(parameters[None])[0])
+        step = float((parameters.detach() - before).abs().max())
+        report(Progress(iteration, best_loss, step))
+        if step < stage.tolerance:
+            break
+    return best
+
+
+def gauss_newton(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:
+    """Gauss-Newton with Levenberg-Marquardt damping (Marquardt 1963) and steps of at most ``stage.step_mm``.
+
+    The gradient is exact; the curvature is taken once and again when steps stop agreeing with it.
+    """
+    parameters = torch.zeros(problem.num_parameters, dtype=torch.float64)
+    loss, gradient = problem.loss_and_gradient(parameters)
+    curvature, fresh = problem.curvature(parameters), True
+    damping, iteration = 1e-3, 0
+    while iteration < stage.iterations:
+        iteration += 1
+        step = _damped_step(curvature, gradient, damping, stage.step_mm)
+        trial = problem.project((parameters + step)[None])[0]
+        step = trial - parameters
+        predicted = float(-(gradient @ step) - 0.5 * step @ curvature @ step)
+        trial_loss = float(problem.losses(trial[None])[0])
+        size = float(step.abs().max())
+        gain = (loss - trial_loss) / max(predicted, 1e-16)
+        if trial_loss < loss:
+            parameters = trial
+            loss, gradient = problem.loss_and_gradient(parameters)
+            damping = max(damping / 5, 1e-6) if gain > 0.5 else damping * 2
+            fresh = False
+        else:
+            damping *= 8
+        report(Progress(iteration, loss, size))
+        if size < stage.tolerance:
+            break
+        if not fresh and gain < 0.25:
+            curvature, fresh = problem.curvature(parameters), True
+        elif fresh and damping > 1e6:
+            break
+    return parameters
+
+
+def _damped_step(curvature: Tensor, gradient: Tensor, damping: float, longest: float) -> Tensor:
+    """The Levenberg-Marquardt step, shortened until no parameter moves by more than ``longest``."""
+    diagonal = curvature.diagonal()
+    floor = 1e-6 * diagonal.mean()
+    step = -torch.linalg.solve(curvature + torch.diag(damping * diagonal + floor), gradient)
+    return step * min(1.0, longest / max(float(step.abs().max()), 1e-12))

@@ -1,0 +1,107 @@
+"""The loop of a registration: stage after stage, from one rigid group to many (section 2.3 of the paper)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from torchkcreg.geometry import transform_points
+
+from .callbacks import Callback
+from .config import RegistrationConfig
+from .data import RegistrationData
+from .objective import StageObjective
+from .optimizers import Progress, minimize
+from .result import RegistrationResult
+from .scene import Scene
+
+
+class Trainer:
+    """Runs the stages of a configuration on a scene and keeps their history.
+
+    Args:
+        scene: What is registered; its pose, deformation and intensity model are updated in place.
+        data: What it is registered to.
+        config: Stages, penalties, seed.
+        callbacks: Called at the start and end of stages and after each iteration.
+
+    A checkpoint (:meth:`state_dict`) is complete at the end of a stage: a trainer that loads it continues with the
+    next stage and ends with the same bits as one that was never stopped.
+    """
+
+    def __init__(
+        self, scene: Scene, data: RegistrationData, config: RegistrationConfig, *, callbacks: Sequence[Callback] = ()
+    ) -> None:
+        self.scene, self.data, self.config, self.callbacks = scene, data, config, list(callbacks)
+        self.stages = config.schedule()
+        self.next_stage = 0
+        self.history: list[dict[str, Any]] = []
+
+    def check(self) -> None:
+        """Raises ValueError if the implant lies outside every view at its start pose."""
+        points = transform_points(self.scene.implant_to_world, self.scene.implant.points.double())
+        self.data.windowed(points, self.stages[0].margin_mm / self.data.geometry.pixel_spacing[1])
+
+    def fit(self) -> RegistrationResult:
+        """Runs the stages that are left and returns the result."""
+        objective = None
+        while self.next_stage < len(self.stages):
+            objective = self._run_stage(self.next_stage)
+        return self._result(objective)
+
+    def _run_stage(self, index: int) -> StageObjective:
+        stage, start = self.stages[index], time.perf_counter()
+        for callback in self.callbacks:
+            callback.on_stage_start(self, index, stage)
+        objective = StageObjective(self.scene, self.data, stage, self.config)
+
+        def report(progress: Progress) -> None:
+            record = {"stage": index, "iteration": progress.iteration, "loss": progress.loss}
+            seconds = time.perf_counter() - start
+            self.history.append({**record, "step_mm": progress.step_mm, "seconds": seconds})
+            for callback in self.callbacks:
+                callback.on_iteration(self, index, progress)
+
+        objective.accept(minimize(objective, stage, seed=self.config.seed + index, report=report))
+        self.next_stage = index + 1
+        for callback in self.callbacks:
+            callback.on_stage_end(self, index, stage)
+        return objective
+
+    def _result(self, objective: StageObjective | None) -> RegistrationResult:
+        scene = self.scene
+        final = StageObjective(scene, self.data, self.stages[-1], self.config)
+        with torch.no_grad():
+            gc = final.gradient_correlations(torch.zeros(1, final.num_parameters, dtype=torch.float64))[0]
+        intensity = {name: float(value) for name, value in scene.intensity.named_parameters()}
+        return RegistrationResult(
+            implant_to_world=scene.implant_to_world.clone(),
+            deformation=scene.deformation,
+            gc=gc,
+            history=self.history,
+            config=self.config,
+            seed=self.config.seed,
+            components=scene.component_motions(),
+            intensity=intensity,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain types that :meth:`load_state_dict` continues from."""
+        scene = {name: value for name, value in self.scene.state_dict().items() if not name.startswith("implant.")}
+        return {"scene": scene, "next_stage": self.next_stage, "history": self.history}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a checkpoint of the same scene and configuration.
+
+        Raises:
+            ValueError: If the checkpoint belongs to another scene.
+        """
+        own = self.scene.state_dict()
+        unknown = [n for n, v in state["scene"].items() if n not in own or own[n].shape != v.shape]
+        if unknown:
+            raise ValueError(f"the checkpoint does not fit this registration: {', '.join(unknown)} differ")
+        self.scene.load_state_dict(state["scene"], strict=False)
+        self.next_stage, self.history = int(state["next_stage"]), list(state["history"])

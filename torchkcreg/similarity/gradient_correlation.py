@@ -1,0 +1,181 @@
+"""Gradient correlation (GC), the similarity of eq. 4 of Cao et al. (2020)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from torchkcreg.similarity.ncc import largest_value, unit_contrast
+from torchkcreg.similarity.sobel import erode_mask, sobel_gradient
+
+# Pixels worked on at once on a CPU. Candidates beyond that follow in the next block: its buffers then stay in cache,
+# where a whole population's would be fetched from (and given back to) the operating system in every pass.
+_PIXELS_PER_BLOCK = 2**18
+
+
+def gradient_correlation(moving: Tensor, fixed: Tensor, *, mask: Tensor | None = None) -> Tensor:
+    """Gradient correlation of each view, 1 for a perfect match (eq. 4 of Cao et al. 2020).
+
+    GC = (NCC(d_u moving, d_u fixed) + NCC(d_v moving, d_v fixed)) / 2 with Sobel derivatives and NCC's means over the
+    mask. GC(a x + b) = GC(x) for a > 0. A flat derivative image contributes 0, with zero gradient, never NaN.
+
+    Args:
+        moving: rendered images, shape (..., V, rows, cols).
+        fixed: measured images, shape (V, rows, cols) or with leading axes that broadcast against those of `moving`.
+        mask: shape (V, rows, cols), nonzero where pixels count. It is eroded by 3 x 3 pixels, so what masked pixels
+            hold (NaN included) never enters. None counts all.
+
+    Returns:
+        Tensor of shape (..., V), differentiable in both images.
+
+    Raises:
+        ValueError: if shapes do not fit.
+
+    Example:
+        >>> x = torch.rand(2, 16, 16)
+        >>> gradient_correlation(torch.stack([2 * x + 1, -x]), x).round(decimals=4)
+        tensor([[ 1.,  1.],
+                [-1., -1.]])
+    """
+    _check_images(moving, fixed)
+    if mask is not None:
+        _check_mask(mask, fixed)
+    eroded = None if mask is None else erode_mask(mask)
+    unit_fixed = _unit_gradients(fixed, mask, eroded)
+    return _in_blocks(lambda block: _correlate(block, unit_fixed, mask, eroded), moving, whole=fixed.ndim > 3)
+
+
+class GradientCorrelation(nn.Module):
+    """Gradient correlation with measured images whose side of the work is done once.
+
+    Args:
+        fixed: measured images, shape (V, rows, cols), finite where they count.
+        mask: shape (V, rows, cols), nonzero where pixels count, see `gradient_correlation`.
+
+    Raises:
+        ValueError: if shapes do not fit, or `fixed` is not finite at a pixel that counts.
+
+    Attributes:
+        unit_gradients: buffer (V, 2, rows, cols), the fixed derivatives with mean 0 and norm 1 over the mask.
+        mask: boolean buffer (V, rows, cols) or None.
+        eroded_mask: boolean buffer (V, rows, cols) or None, the pixels whose derivatives count.
+
+    Example:
+        >>> x = torch.rand(3, 16, 16)
+        >>> gc = GradientCorrelation(x)
+        >>> candidates = x + torch.zeros(5, 1, 1, 1)
+        >>> gc(candidates).shape, gc.residuals(candidates).shape
+        (torch.Size([5, 3]), torch.Size([5, 3, 2, 16, 16]))
+    """
+
+    unit_gradients: Tensor
+    mask: Tensor | None
+    eroded_mask: Tensor | None
+
+    def __init__(self, fixed: Tensor, mask: Tensor | None = None) -> None:
+        super().__init__()
+        if fixed.ndim != 3:
+            raise ValueError(f"fixed must have shape (V, rows, cols), got {tuple(fixed.shape)}")
+        if mask is not None:
+            _check_mask(mask, fixed)
+            mask = mask.detach() != 0
+        counted = torch.isfinite(fixed) if mask is None else torch.isfinite(fixed) | ~mask
+        if not counted.all():
+            raise ValueError(f"fixed must be finite where it counts, got {int((~counted).sum())} pixels that are not")
+        eroded = None if mask is None else erode_mask(mask)
+        self.register_buffer("mask", mask)
+        self.register_buffer("eroded_mask", eroded)
+        self.register_buffer("unit_gradients", _unit_gradients(fixed.detach(), mask, eroded))
+
+    @property
+    def num_views(self) -> int:
+        """Number of views V."""
+        return self.unit_gradients.shape[0]
+
+    def forward(self, moving: Tensor) -> Tensor:
+        """GC of each view, shape (..., V), of rendered images (..., V, rows, cols)."""
+        _check_images(moving, self.unit_gradients[:, 0])
+        return _in_blocks(lambda b: _correlate(b, self.unit_gradients, self.mask, self.eroded_mask), moving)
+
+    def residuals(self, moving: Tensor) -> Tensor:
+        """Differences of the unit gradients of `moving` and of the fixed images, for least-squares methods.
+
+        Since 1 - NCC(a, b) = |a/|a| - b/|b||^2 / 2 for images without their means, their squares sum to the loss:
+        1 - GC = sum residuals^2 / 4 over (2, rows, cols). Where `moving` is flat (NCC 0) the fixed unit gradients,
+        scaled to keep this true, are the residual. A fixed view that is flat has nothing to say: its residuals are 0.
+
+        Args:
+            moving: rendered images, shape (..., V, rows, cols).
+
+        Returns:
+            Tensor of shape (..., V, 2, rows, cols).
+        """
+        _check_images(moving, self.unit_gradients[:, 0])
+        fixed_says = (self.unit_gradients != 0).any(-1).any(-1)[..., None, None]
+
+        def difference(block: Tensor) -> Tensor:
+            unit = _unit_gradients(block, self.mask, self.eroded_mask)
+            flat = torch.linalg.vector_norm(unit.detach(), dim=(-2, -1), keepdim=True) == 0
+            target = torch.where(flat, math.sqrt(2.0), 1.0).to(self.unit_gradients.dtype) * self.unit_gradients
+            return unit * fixed_says - target
+
+        return _in_blocks(difference, moving)
+
+
+class GradientCorrelationLoss(nn.Module):
+    """1 - GC averaged over the views: falls as the match gets better, 0 at its best, 2 at its worst.
+
+    Args:
+        fixed: measured images, shape (V, rows, cols).
+        mask: shape (V, rows, cols), nonzero where pixels count, see `gradient_correlation`.
+
+    Example:
+        >>> x = torch.rand(3, 16, 16)
+        >>> GradientCorrelationLoss(x)(x).abs() < 1e-5
+        tensor(True)
+    """
+
+    def __init__(self, fixed: Tensor, mask: Tensor | None = None) -> None:
+        super().__init__()
+        self.similarity = GradientCorrelation(fixed, mask)
+
+    def forward(self, moving: Tensor) -> Tensor:
+        """Loss of each candidate, shape (...), of rendered images (..., V, rows, cols)."""
+        return 1.0 - self.similarity(moving).mean(-1)
+
+
+def _correlate(moving: Tensor, unit_fixed: Tensor, mask: Tensor | None, eroded: Tensor | None) -> Tensor:
+    return 0.5 * (_unit_gradients(moving, mask, eroded) * unit_fixed).sum((-3, -2, -1))
+
+
+def _unit_gradients(images: Tensor, mask: Tensor | None, eroded: Tensor | None) -> Tensor:
+    """Sobel derivatives with mean 0 and norm 1 over the eroded mask, (..., V, 2, rows, cols); 0 where flat."""
+    if mask is not None:
+        images = torch.where(mask != 0, images, 0.0)  # before Sobel: NaN times a mask would stay NaN
+    scale = largest_value(images)[..., None]
+    return unit_contrast(sobel_gradient(images), None if eroded is None else eroded[..., None, :, :], scale)
+
+
+def _in_blocks(function: Callable[[Tensor], Tensor], moving: Tensor, *, whole: bool = False) -> Tensor:
+    """`function` of (K, V, rows, cols) images, a few candidates at a time, with the leading axes put back."""
+    if whole or moving.device.type != "cpu" or moving.numel() <= _PIXELS_PER_BLOCK:
+        return function(moving)
+    flat = moving.reshape(-1, *moving.shape[-3:])
+    size = max(1, _PIXELS_PER_BLOCK // flat[0].numel())
+    result = torch.cat([function(block) for block in flat.split(size)])
+    return result.reshape(*moving.shape[:-3], *result.shape[1:])
+
+
+def _check_images(moving: Tensor, fixed: Tensor) -> None:
+    if fixed.ndim < 3 or moving.ndim < 3 or moving.shape[-3:] != fixed.shape[-3:]:
+        raise ValueError(
+            f"moving and fixed must agree in (V, rows, cols), got {tuple(moving.shape)} and {tuple(fixed.shape)}"
+        )
+
+
+def _check_mask(mask: Tensor, fixed: Tensor) -> None:
+    if mask.shape != fixed.shape[-3:]:
+        raise ValueError(f"mask must have shape {tuple(fixed.shape[-3:])}, got {tuple(mask.shape)}")

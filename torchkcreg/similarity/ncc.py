@@ -1,0 +1,79 @@
+"""Normalised cross-correlation that knows what a flat image is."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# An image counts as flat when its RMS contrast is below this many rounding errors of its largest value: what is left
+# is then noise of the arithmetic. Relative, so that it does not matter whether values are 1e-3 or 20.
+_FLAT_ROUNDINGS = 16.0
+
+
+def normalized_cross_correlation(a: Tensor, b: Tensor, *, mask: Tensor | None = None) -> Tensor:
+    """Normalised cross-correlation of each pair of images over its mask: 1 for a perfect match, -1 for the opposite.
+
+    NCC = sum (a - mean a)(b - mean b) / sqrt(sum (a - mean a)^2 sum (b - mean b)^2), sums and means over the mask.
+    A flat image (no contrast beyond rounding, or no pixel that counts) gives 0, and zero gradients.
+
+    Args:
+        a: images, shape (..., rows, cols).
+        b: images that broadcast against `a`.
+        mask: shape (..., rows, cols), broadcastable, nonzero where pixels count. What masked pixels hold
+            (NaN included) does not matter. None counts all.
+
+    Returns:
+        Correlations of shape (...).
+
+    Raises:
+        ValueError: if the images or the mask have different (rows, cols).
+
+    Example:
+        >>> a = torch.rand(2, 8, 8)
+        >>> normalized_cross_correlation(a, 3 * a + 1).round(decimals=4)
+        tensor([1., 1.])
+    """
+    _check_same_size(a, b, "b")
+    if mask is not None:
+        _check_same_size(a, mask, "mask")
+        a, b = (torch.where(mask != 0, image, 0.0) for image in (a, b))
+    unit_a, unit_b = (unit_contrast(image, mask, largest_value(image)) for image in (a, b))
+    return (unit_a * unit_b).sum((-2, -1))
+
+
+def unit_contrast(images: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
+    """Images minus their mean over the mask, zero outside it, scaled to Euclidean norm 1; all zero if flat.
+
+    Args:
+        images: shape (..., rows, cols), finite.
+        mask: broadcastable to `images`, nonzero where pixels count, or None.
+        scale: shape (...), the size of the values that `images` were computed from: contrast below
+            16 rounding errors of it is noise, and the image flat.
+
+    Returns:
+        Tensor of the shape of `images`. Its gradients are finite everywhere, and zero for flat images.
+    """
+    if mask is None:
+        count = torch.tensor(float(images.shape[-2] * images.shape[-1]), dtype=images.dtype, device=images.device)
+        contrast = images - images.mean((-2, -1), keepdim=True)
+    else:
+        weight = (mask != 0).to(images.dtype)
+        count = weight.sum((-2, -1))
+        mean = (images * weight).sum((-2, -1)) / count.clamp(min=1.0)
+        contrast = (images - mean[..., None, None]) * weight
+    power = contrast.square().sum((-2, -1))
+    floor = count * (_FLAT_ROUNDINGS * torch.finfo(images.dtype).eps * scale.detach()).square()
+    sharp = power > floor.clamp(min=torch.finfo(images.dtype).tiny)
+    # The inner `where` keeps the square root's infinite slope at 0 out of the backward pass.
+    inverse_norm = torch.where(sharp, torch.where(sharp, power, 1.0).rsqrt(), 0.0)
+    return contrast * inverse_norm[..., None, None]
+
+
+def largest_value(images: Tensor) -> Tensor:
+    """Largest absolute value of each image, shape (...), without gradient."""
+    return torch.linalg.vector_norm(images.detach(), float("inf"), dim=(-2, -1))
+
+
+def _check_same_size(a: Tensor, other: Tensor, name: str) -> None:
+    if a.shape[-2:] != other.shape[-2:]:
+        raise ValueError(f"{name} must have (rows, cols) = {tuple(a.shape[-2:])}, got shape {tuple(other.shape)}")

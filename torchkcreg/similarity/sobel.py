@@ -1,0 +1,113 @@
+"""Sobel derivatives of images, and the mask of pixels whose derivatives can be trusted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from kornia.filters import spatial_gradient
+from torch import Tensor
+
+# Adjoint kernels, (gradient image of u and v) -> image. Both Sobel kernels are odd: turned by 180 degrees, as an
+# adjoint asks, they only change sign.
+_ADJOINT_SOBEL = (
+    ((0.125, 0.0, -0.125), (0.25, 0.0, -0.25), (0.125, 0.0, -0.125)),
+    ((0.125, 0.25, 0.125), (0.0, 0.0, 0.0), (-0.125, -0.25, -0.125)),
+)
+
+
+def sobel_gradient(images: Tensor) -> Tensor:
+    """Sobel derivatives of images in grey values per pixel, along u (columns) first, then along v (rows).
+
+    The kernel is normalised (a ramp of slope 1 has derivative 1) and the border pixels are repeated outwards, both
+    as in `kornia.filters.spatial_gradient`, which does the work.
+
+    Args:
+        images: any leading axes, shape (..., rows, cols), floating point.
+
+    Returns:
+        Derivatives of shape (..., 2, rows, cols).
+
+    Raises:
+        ValueError: if `images` has fewer than two axes, is empty or is not floating point.
+
+    Example:
+        >>> ramp = torch.arange(5.0).expand(4, 5)
+        >>> sobel_gradient(ramp)[0, 2]
+        tensor([0.5000, 1.0000, 1.0000, 1.0000, 0.5000])
+    """
+    if images.ndim < 2 or images.numel() == 0:
+        raise ValueError(f"images must have shape (..., rows, cols) and not be empty, got {tuple(images.shape)}")
+    if not images.is_floating_point():
+        raise ValueError(f"images must be floating point, got {images.dtype}")
+    # One channel each: kornia then folds all leading axes into the batch of a single convolution.
+    flat = _Sobel.apply(images.reshape(-1, 1, *images.shape[-2:]))
+    return flat.reshape(*images.shape[:-2], 2, *images.shape[-2:])
+
+
+def erode_mask(mask: Tensor) -> Tensor:
+    """Mask of the pixels whose 3 x 3 neighbourhood counts as a whole, so that no masked value enters a derivative.
+
+    Args:
+        mask: shape (..., rows, cols), nonzero where pixels count. The image's border itself masks nothing.
+
+    Returns:
+        Boolean mask of the same shape.
+    """
+    bad = (mask == 0).to(torch.float32).reshape(-1, 1, *mask.shape[-2:])
+    return (F.max_pool2d(bad, kernel_size=3, stride=1, padding=1) == 0).reshape(mask.shape)
+
+
+class _Sobel(torch.autograd.Function):
+    """kornia's Sobel filter of (B, 1, rows, cols), with its adjoint as a plain convolution.
+
+    Autograd's own adjoint is a transposed convolution, which on a CPU takes five to ten times as long.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(images: Tensor) -> Tensor:
+        return spatial_gradient(images, mode="sobel", order=1, normalized=True).squeeze(1)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return _SobelAdjoint.apply(grad)
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
+        return _Sobel.apply(tangent)
+
+
+class _SobelAdjoint(torch.autograd.Function):
+    """Adjoint of `_Sobel`: (B, 2, rows, cols) -> (B, 1, rows, cols)."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(gradients: Tensor) -> Tensor:
+        kernel = torch.tensor(_ADJOINT_SOBEL, dtype=gradients.dtype, device=gradients.device)[None]
+        padded = F.conv2d(gradients, kernel, padding=2)
+        # Adjoint of repeating the border: what fell outside returns to the border pixel it was a copy of.
+        padded[..., 1, :] += padded[..., 0, :]
+        padded[..., -2, :] += padded[..., -1, :]
+        padded[..., :, 1] += padded[..., :, 0]
+        padded[..., :, -2] += padded[..., :, -1]
+        return padded[..., 1:-1, 1:-1].contiguous()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return _Sobel.apply(grad)
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
+        return _SobelAdjoint.apply(tangent)

@@ -1,0 +1,195 @@
+"""Implants as meshes: locking plates, flared curved plates, screws, a hollow bone with a gap, beads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+import trimesh
+
+from torchkcreg.simulation.loads import RodMotion
+from torchkcreg.simulation.outline import plate_outline
+
+
+def locking_plate(
+    *,
+    length: float = 188.0,
+    width: float = 13.5,
+    thickness: float = 4.6,
+    num_holes: int = 10,
+    hole_radius: float = 2.4,
+    end_margin: float = 4.0,
+    max_edge: float = 2.5,
+) -> trimesh.Trimesh:
+    """Watertight mesh of a straight plate with through holes in one row and rounded ends, centred on the origin.
+
+    Long axis z, width x, thickness y; the bone is on the side of negative y. No edge is much longer than `max_edge`, so
+    that the mesh bends smoothly.
+
+    Args:
+        length: Length along z, mm.
+        width: Width along x, mm.
+        thickness: Thickness along y, mm.
+        num_holes: Holes, evenly spaced; see `hole_positions`.
+        hole_radius: Radius of a hole, mm.
+        end_margin: Length of each rounded end, mm; the rest is divided evenly among the holes.
+        max_edge: Target length of the longest edges, mm.
+
+    Raises:
+        ValueError: If a hole does not fit into its part of the plate, or a size is not positive.
+
+    >>> plate = locking_plate()
+    >>> plate.is_watertight, plate.extents.round(2).tolist()
+    (True, [13.5, 4.6, 188.0])
+    """
+    for name, value in (("length", length), ("width", width), ("thickness", thickness), ("max_edge", max_edge)):
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}")
+    points, triangles = plate_outline(length, width, num_holes, hole_radius, end_margin, max_edge)
+    return _extruded(points, triangles, thickness, max(1, math.ceil(thickness / max_edge)))
+
+
+def hole_positions(*, length: float = 188.0, num_holes: int = 10, end_margin: float = 4.0) -> list[float]:
+    """Centres of a plate's holes along z in mm, from the lowest up.
+
+    >>> hole_positions()[:2]
+    [-81.0, -63.0]
+    """
+    pitch = (length - 2 * end_margin) / num_holes
+    return [(hole - (num_holes - 1) / 2) * pitch for hole in range(num_holes)]
+
+
+def flared_plate(
+    *,
+    length: float = 160.0,
+    width: float = 13.0,
+    thickness: float = 4.0,
+    num_holes: int = 8,
+    flare: float = 1.8,
+    bow_deg: float = 12.0,
+    twist_deg: float = 10.0,
+    max_edge: float = 2.5,
+) -> trimesh.Trimesh:
+    """Watertight mesh of an anatomical plate: flared towards +z, bowed about x, twisted about its long axis.
+
+    Args:
+        length: Length along its axis, mm.
+        width: Width of the shaft, mm.
+        thickness: Thickness, mm.
+        num_holes: Holes along the axis.
+        flare: Width of the head over that of the shaft.
+        bow_deg: Angle between the two ends about x, degrees.
+        twist_deg: Angle between the two ends about the axis, degrees.
+        max_edge: Target length of the longest edges, mm.
+
+    Raises:
+        ValueError: As `locking_plate`.
+    """
+    plate = locking_plate(
+        length=length, width=width, thickness=thickness, num_holes=num_holes, hole_radius=2.25, max_edge=max_edge
+    )
+    vertices = torch.tensor(np.asarray(plate.vertices), dtype=torch.float64)
+    share = ((vertices[:, 2] / length - 0.05) / 0.35).clamp(0, 1)
+    vertices[:, 0] *= 1 + (flare - 1) * share**2 * (3 - 2 * share)
+    rate = torch.deg2rad(torch.tensor([bow_deg, 0.0, twist_deg], dtype=torch.float64)) / length
+    bent = RodMotion(lambda z: rate.expand(len(z), 3), (-length / 2, length / 2))
+    return trimesh.Trimesh(bent(vertices).numpy(), plate.faces, process=False)
+
+
+def locking_screws(
+    positions: Sequence[float],
+    *,
+    head_y: float = 2.3,
+    tip_y: float = -34.0,
+    radius: float = 2.0,
+    material: str = "steel",
+) -> list[dict[str, object]]:
+    """Screws through a plate at heights z as cylinders from head to tip, each a dict as `screws.json` lists them.
+
+    Keys: `from` and `to`, [x, y, z] in mm in the plate's frame, `radius`, `material`, and the bone's `fragment` that
+    holds it, `distal` below z = 0 and `proximal` above.
+
+    >>> locking_screws([-63.0])[0]["fragment"]
+    'distal'
+    """
+    return [
+        {
+            "from": [0.0, float(head_y), float(z)],
+            "to": [0.0, float(tip_y), float(z)],
+            "radius": float(radius),
+            "material": material,
+            "fragment": "distal" if z < 0 else "proximal",
+        }
+        for z in positions
+    ]
+
+
+def screw_mesh(screw: dict[str, object], *, sections: int = 32) -> trimesh.Trimesh:
+    """Watertight mesh of a screw, a cylinder from its head to its tip."""
+    segment = np.array([screw["from"], screw["to"]], dtype=float)
+    return trimesh.creation.cylinder(radius=screw["radius"], segment=segment, sections=sections)
+
+
+def bone_fragments(
+    *,
+    outer_radius: float = 13.0,
+    inner_radius: float = 8.0,
+    offset_y: float = -17.0,
+    half_length: float = 150.0,
+    gap: float = 4.0,
+    sections: int = 64,
+) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """Watertight meshes of the two fragments, distal and proximal, of a hollow bone along z with a gap at z = 0.
+
+    Args:
+        outer_radius: Outer radius, mm.
+        inner_radius: Radius of the marrow's channel, mm.
+        offset_y: Where the bone's axis lies, mm: behind the plate.
+        half_length: From z = 0 to either end, mm.
+        gap: Width of the gap, mm.
+        sections: Segments around.
+
+    Raises:
+        ValueError: If the radii or the gap leave nothing of the bone.
+    """
+    if not 0 < inner_radius < outer_radius:
+        raise ValueError(f"inner_radius must lie between 0 and {outer_radius}, got {inner_radius}")
+    if not 0 <= gap < 2 * half_length:
+        raise ValueError(f"gap must lie between 0 and {2 * half_length}, got {gap}")
+    height = half_length - gap / 2
+    fragments = []
+    for side in (-1, 1):
+        tube = trimesh.creation.annulus(r_min=inner_radius, r_max=outer_radius, height=height, sections=sections)
+        tube.apply_translation([0, offset_y, side * (gap + height) / 2])
+        fragments.append(tube)
+    return fragments[0], fragments[1]
+
+
+def bead_meshes(centers: Sequence[Sequence[float]], *, radius: float = 1.0) -> Iterator[trimesh.Trimesh]:
+    """Meshes of round beads about some centres, mm."""
+    for center in centers:
+        bead = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+        bead.apply_translation(np.asarray(center, dtype=float))
+        yield bead
+
+
+def _extruded(points: np.ndarray, triangles: np.ndarray, thickness: float, layers: int) -> trimesh.Trimesh:
+    """A flat triangulation in (x, z) extruded along y, its side walls in `layers` layers."""
+    count = len(points)
+    heights = np.linspace(thickness / 2, -thickness / 2, layers + 1)
+    vertices = np.concatenate([np.insert(points, 1, height, axis=1) for height in heights])
+    directed = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    keys, reverse = directed @ [count, 1], directed @ [1, count]
+    rim = directed[~np.isin(keys, reverse)]  # edges without a neighbour: the outline and the holes
+    faces = [triangles, triangles[:, ::-1] + layers * count]
+    for layer in range(layers):
+        start, end = (rim + layer * count).T
+        faces.append(np.stack([end, start, start + count], axis=1))
+        faces.append(np.stack([end, start + count, end + count], axis=1))
+    mesh = trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+    mesh.remove_unreferenced_vertices()
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh

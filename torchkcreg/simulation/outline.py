@@ -1,0 +1,83 @@
+"""The flat outline of a plate with holes, triangulated in regular patches: one around each hole, one at each end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+DECIMALS = 6  # points nearer than a nanometre are one
+CORNER_SHARE = 0.25  # length of a rounded end at the plate's edges, relative to its middle
+
+
+def plate_outline(
+    length: float, width: float, num_holes: int, hole_radius: float, end_margin: float, max_edge: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 2) in (x, z) and triangles (m, 3) of a plate along z with a row of holes and rounded ends.
+
+    All triangles turn the same way. Sizes in mm, as `locking_plate` takes them.
+
+    Raises:
+        ValueError: If a hole does not fit into its patch, or the ends leave no room.
+    """
+    pitch = (length - 2 * end_margin) / max(num_holes, 1)
+    if num_holes < 1 or not 0 < end_margin < length / 2:
+        raise ValueError(f"num_holes and end_margin must fit a length of {length}, got {num_holes} and {end_margin}")
+    if not 0 < hole_radius < 0.95 * min(pitch, width) / 2:
+        raise ValueError(f"hole_radius must be positive and fit into {pitch:g} x {width:g} mm, got {hole_radius}")
+    across, along = math.ceil(width / max_edge), math.ceil(pitch / max_edge)
+    patches = []
+    for hole in range(num_holes):
+        center = (hole - (num_holes - 1) / 2) * pitch
+        patches.append(_hole_patch(center, width, pitch, hole_radius, across, along, max_edge))
+    for side in (-1, 1):
+        patches.append(_end_patch(side, length / 2 - end_margin, width, end_margin, across, max_edge))
+    return _merged(patches)
+
+
+def _hole_patch(
+    center: float, width: float, height: float, radius: float, across: int, along: int, max_edge: float
+) -> np.ndarray:
+    """Grid (layers + 1, around, 2) from a hole's rim out to its rectangle, the first point repeated at the end."""
+    x = np.linspace(-width / 2, width / 2, across + 1)
+    z = np.linspace(-height / 2, height / 2, along + 1)
+    rectangle = np.concatenate(
+        [
+            np.stack([np.full(along, width / 2), z[:-1]], axis=1),
+            np.stack([x[:0:-1], np.full(across, height / 2)], axis=1),
+            np.stack([np.full(along, -width / 2), z[:0:-1]], axis=1),
+            np.stack([x[:-1], np.full(across, -height / 2)], axis=1),
+        ]
+    )
+    rectangle = np.concatenate([rectangle, rectangle[:1]])
+    rim = radius * rectangle / np.linalg.norm(rectangle, axis=1, keepdims=True)
+    layers = math.ceil((math.hypot(width, height) / 2 - radius) / max_edge)
+    share = np.linspace(0, 1, layers + 1)[:, None, None]
+    return rim + share * (rectangle - rim) + [0.0, center]
+
+
+def _end_patch(side: int, start: float, width: float, margin: float, across: int, max_edge: float) -> np.ndarray:
+    """Grid (layers + 1, across + 1, 2) from the last hole's rectangle to the plate's rounded end."""
+    x = np.linspace(-width / 2, width / 2, across + 1)
+    reach = margin * (CORNER_SHARE + (1 - CORNER_SHARE) * np.sqrt(np.maximum(0, 1 - (2 * x / width) ** 2)))
+    layers = math.ceil(margin / max_edge)
+    z = side * (start + np.linspace(0, 1, layers + 1)[:, None] * reach)
+    return np.stack(np.broadcast_arrays(x, z), axis=2)
+
+
+def _merged(patches: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """One triangulation of grids of points that share their borders, all triangles turning the same way."""
+    points, triangles, first = [], [], 0
+    for patch in patches:
+        rows, cols = patch.shape[:2]
+        index = first + np.arange(rows * cols).reshape(rows, cols)
+        a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+        points.append(patch.reshape(-1, 2))
+        triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+        first += rows * cols
+    _, kept, names = np.unique(np.concatenate(points).round(DECIMALS), axis=0, return_index=True, return_inverse=True)
+    flat, joined = np.concatenate(points)[kept], names.ravel()[np.concatenate(triangles)]
+    edges = flat[joined[:, 1:]] - flat[joined[:, :1]]
+    clockwise = edges[:, 0, 0] * edges[:, 1, 1] < edges[:, 0, 1] * edges[:, 1, 0]
+    joined[clockwise] = joined[clockwise, ::-1]
+    return flat, joined

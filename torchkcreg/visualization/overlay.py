@@ -1,0 +1,128 @@
+"""Measured projections with the registered implant laid over them (fig. 3A of the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+GREEN = np.array([0.10, 0.95, 0.40])
+_OPACITY = 0.6
+_PANEL_HEIGHT_IN = 5.0
+_NARROWEST_IN, _WIDEST_IN = 1.15, 5.0
+
+
+def overlay_figure(
+    measured: Tensor,
+    after: Tensor,
+    *,
+    before: Tensor | None = None,
+    view_labels: Sequence[str] | None = None,
+    gc_before: Tensor | None = None,
+    gc_after: Tensor | None = None,
+    pixel_spacing: tuple[float, float] | None = None,
+    margin_px: int = 20,
+    crop: bool = True,
+) -> Figure:
+    """A figure of projections in grey with the implant's DRR in green, a column a view, before (if given) over after.
+
+    Dense is bright, as on a radiograph. Where the DRR covers the implant's shadow, the shadow is green; where it does
+    not, it stays white, and green lies on the background: so a misfit shows on both sides. A thin line follows the
+    DRR's outline.
+
+    Args:
+        measured: line integrals (V, rows, cols).
+        after: DRRs of the registered implant, same shape, any unit.
+        before: DRRs at the start, same shape.
+        view_labels: title of each column ("91 deg, T1").
+        gc_before: gradient correlation of each view at the start (V,), written into the panels.
+        gc_after: the same at the end.
+        pixel_spacing: (dv, du) in mm, for a scale bar at the detector and square millimetres.
+        margin_px: pixels kept around the implant.
+        crop: show only the implant's surroundings, the same size in each view.
+
+    Raises:
+        ValueError: shapes differ.
+    """
+    for name, images in (("measured", measured), ("before", before), ("after", after)):
+        if images is not None and (images.ndim != 3 or images.shape != after.shape):
+            raise ValueError(
+                f"{name} must have shape (V, rows, cols) = {tuple(after.shape)}, got {tuple(images.shape)}"
+            )
+    rows = [(name, drr, gc) for name, drr, gc in (("before", before, gc_before), ("after", after, gc_after))]
+    rows = [row for row in rows if row[1] is not None]
+    images = measured.detach().cpu().double().numpy()
+    drrs = [drr.detach().cpu().double().numpy() for _, drr, _ in rows if drr is not None]
+    windows = _windows(drrs, margin_px) if crop else [(slice(None), slice(None))] * len(images)
+    dv, du = pixel_spacing or (1.0, 1.0)
+
+    height, width = images[0][windows[0]].shape
+    panel_in = float(np.clip(_PANEL_HEIGHT_IN * width * du / (height * dv), _NARROWEST_IN, _WIDEST_IN))
+    panel_height_in = min(_PANEL_HEIGHT_IN, panel_in * height * dv / (width * du))
+    figure = Figure(
+        figsize=(len(images) * (panel_in + 0.12) + 0.4, len(rows) * (panel_height_in + 0.1) + 0.4),
+        layout="constrained",
+        facecolor="white",
+    )
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0.01, hspace=0.01)  # type: ignore[union-attr]
+    axes = figure.subplots(len(rows), len(images), squeeze=False)
+    for i, ((name, _, gc), drr) in enumerate(zip(rows, drrs)):
+        axes[i, 0].set_ylabel(name, fontsize=11)
+        for view, window in enumerate(windows):
+            _draw(axes[i, view], images[view][window], drr[view][window], dv / du)
+            if gc is not None:
+                _write(axes[i, view], f"GC {float(gc[view]):.3f}")
+    for view in range(len(images)):
+        axes[0, view].set_title(f"view {view}" if view_labels is None else view_labels[view], fontsize=10)
+    if pixel_spacing is not None:
+        _scale_bar(axes[-1, 0], height, width * du, du)
+    return figure
+
+
+def _windows(drrs: list[NDArray], margin_px: int) -> list[tuple[slice, slice]]:
+    """Rows and columns around the implant in each view, of one size."""
+    shadow = np.max([drr > 0.02 * max(drr.max(), 1e-12) for drr in drrs], axis=0)
+    _, num_rows, num_cols = shadow.shape
+    boxes = []
+    for view in shadow:
+        v, u = np.nonzero(view.any(1))[0], np.nonzero(view.any(0))[0]
+        boxes.append((v[0], v[-1] + 1, u[0], u[-1] + 1) if len(v) else (0, num_rows, 0, num_cols))
+    height = min(num_rows, max(box[1] - box[0] for box in boxes) + 2 * margin_px)
+    width = max(box[3] - box[2] for box in boxes) + 2 * margin_px
+    width = min(num_cols, max(width, height // 4))  # room for the text beside a slim plate seen edge on
+    windows = []
+    for top, bottom, left, right in boxes:
+        v = int(np.clip((top + bottom - height) // 2, 0, num_rows - height))
+        u = int(np.clip((left + right - width) // 2, 0, num_cols - width))
+        windows.append((slice(v, v + height), slice(u, u + width)))
+    return windows
+
+
+def _draw(axes: Axes, image: NDArray, drr: NDArray, aspect: float) -> None:
+    low, high = np.percentile(image, [1.0, 99.5])
+    grey = np.clip((image - low) / max(high - low, 1e-12), 0, 1)[..., None]
+    thickness = np.clip(drr / max(float(np.percentile(drr[drr > 0], 90)) if (drr > 0).any() else 1.0, 1e-12), 0, 1)
+    alpha = _OPACITY * np.sqrt(thickness)[..., None]
+    composite = grey * (1 - alpha) + GREEN * (0.25 + 0.75 * grey) * alpha
+    axes.imshow(composite, origin="upper", aspect=aspect)
+    if drr.max() > 0:
+        axes.contour(thickness, levels=[0.15], colors=[GREEN], linewidths=0.6)
+    axes.set(xticks=[], yticks=[])
+    for side in axes.spines.values():
+        side.set_visible(False)
+
+
+def _write(axes: Axes, text: str) -> None:
+    box = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none", "boxstyle": "round,pad=0.25"}
+    axes.text(0.03, 0.985, text, transform=axes.transAxes, color="white", fontsize=8, va="top", ha="left", bbox=box)
+
+
+def _scale_bar(axes: Axes, height: int, width_mm: float, du: float) -> None:
+    length = max((mm for mm in (1, 2, 5, 10, 20, 50, 100) if mm <= 0.5 * width_mm), default=1)
+    left, bottom = 0.06 * width_mm / du, 0.975 * height
+    axes.plot([left, left + length / du], [bottom, bottom], color="white", linewidth=2.5, solid_capstyle="butt")
+    axes.text(left + length / du / 2, bottom - 0.012 * height, f"{length} mm", color="white", fontsize=8, ha="center")
