@@ -45,7 +45,8 @@ def test_the_moments_of_a_ball_are_those_of_the_ball() -> None:
 
 
 def test_nodes_stand_at_the_centres_of_lattice_cells() -> None:
-    cloud = ImplantPointCloud.from_mesh(_solids()["turned box"], 0.4, origin=(0.1, 0.2, 0.3), dtype=torch.float64)
+    corner, box = (0.1, 0.2, 0.3), _solids()["turned box"]
+    cloud = ImplantPointCloud.from_mesh(box, 0.4, origin=corner, at_centroids=False, dtype=torch.float64)
     in_cells = (cloud.points - torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)) / 0.4
     torch.testing.assert_close(in_cells - in_cells.floor(), torch.full_like(in_cells, 0.5), rtol=0, atol=1e-9)
     assert torch.equal(cloud.cell, 0.4 * torch.eye(3, dtype=torch.float64))
@@ -76,7 +77,7 @@ def test_a_cloud_reloads_from_its_state() -> None:
 
 
 def test_nodes_are_stored_as_neighbours_whatever_order_they_come_in() -> None:
-    cloud = ImplantPointCloud.from_mesh(_solids()["turned box"], 0.5)
+    cloud = ImplantPointCloud.from_mesh(_solids()["turned box"], 0.5, at_centroids=False)
     shuffle = torch.randperm(cloud.num_nodes, generator=torch.Generator().manual_seed(0))
     again = ImplantPointCloud(cloud.points[shuffle], cloud.masses[shuffle], cloud.cell)
     assert torch.equal(again.points, cloud.points) and torch.equal(again.masses, cloud.masses)

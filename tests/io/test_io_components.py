@@ -1,6 +1,7 @@
 import json
 
 import pytest
+
 from torchkcreg.io import ComponentSpec, read_components, write_components
 
 SCREW = {"from": [1, 2, 3], "to": [1, 2, -30], "radius": 2.0, "material": "steel", "fragment": "distal"}

@@ -2,9 +2,16 @@ import json
 
 import pytest
 import torch
+
 from torchkcreg.io import read_config, write_config
 
-CONFIG = {"preset": "paper", "beta": 1e-4, "grid_shape": [6, 6, 10], "material": None, "stages": [{"groups": 2, "bin": 1}]}
+CONFIG = {
+    "preset": "paper",
+    "beta": 1e-4,
+    "grid_shape": [6, 6, 10],
+    "material": None,
+    "stages": [{"groups": 2, "bin": 1}],
+}
 
 
 @pytest.mark.parametrize("name", ["run.yaml", "run.yml", "run.json"])

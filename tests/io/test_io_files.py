@@ -4,6 +4,7 @@ import math
 import numpy as np
 import pytest
 import torch
+
 from torchkcreg.io.files import atomic_path, finite_array, plain, read_json, write_json, write_text
 
 
@@ -53,7 +54,9 @@ def test_numbers_survive_json_to_the_last_bit(tmp_path):
 
 
 def test_plain_turns_tensors_arrays_scalars_tuples_and_paths_into_what_json_holds(tmp_path):
-    content = plain({1: torch.eye(2), "a": np.float32(0.5), "b": (np.int64(3), None, True), "p": tmp_path, "n": math.nan})
+    content = plain(
+        {1: torch.eye(2), "a": np.float32(0.5), "b": (np.int64(3), None, True), "p": tmp_path, "n": math.nan}
+    )
     assert content == {"1": [[1.0, 0.0], [0.0, 1.0]], "a": 0.5, "b": [3, None, True], "p": str(tmp_path), "n": None}
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
@@ -82,7 +85,9 @@ def test_a_missing_file_and_a_folder_are_told_apart(tmp_path):
         read_json(tmp_path, "geometry")
 
 
-@pytest.mark.parametrize("value", [[1, 2], [[1], [2, 3]], ["a", "b", "c"], None, [1, 2, math.nan], [True, False, True], {}])
+@pytest.mark.parametrize(
+    "value", [[1, 2], [[1], [2, 3]], ["a", "b", "c"], None, [1, 2, math.nan], [True, False, True], {}]
+)
 def test_an_array_of_another_shape_or_kind_is_refused_by_name(value):
     with pytest.raises(ValueError, match=r"^radii must be"):
         finite_array(value, (3,), "radii")

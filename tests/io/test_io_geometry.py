@@ -2,6 +2,7 @@ import json
 
 import pytest
 import torch
+
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
 from torchkcreg.io import geometry_to_dict, read_geometry, write_geometry
 
@@ -46,9 +47,7 @@ def test_views_at_different_distances_have_no_common_one(geometry):
 
 
 def test_a_geometry_without_labels_and_with_oblong_pixels_comes_back(tmp_path):
-    matrices = torch.tensor(
-        [[[-1000.0, 0, 50, 20000], [0, 500.0, 25, 10000], [0, 0, 1.0, 400]]], dtype=torch.float64
-    )
+    matrices = torch.tensor([[[-1000.0, 0, 50, 20000], [0, 500.0, 25, 10000], [0, 0, 1.0, 400]]], dtype=torch.float64)
     write_geometry(tmp_path / "g.json", ConeBeamGeometry(matrices, (40, 80), (1.0, 0.5)))
     again = read_geometry(tmp_path / "g.json")
     torch.testing.assert_close(again.projection_matrices, matrices)

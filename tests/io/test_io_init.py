@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+
 from torchkcreg.geometry import rigid_matrix
 from torchkcreg.io import read_init, write_init
 
@@ -65,7 +66,7 @@ def unbounded(pose):
     [
         (scaled, "rigid, but its axes have lengths 1.01"),
         (sheared, "scalar products up to 0.01"),
-        (mirrored, "must not mirror"),
+        (mirrored, "not mirror"),
         (projective, "last row 0 0 0 1"),
         (unbounded, "finite"),
     ],

@@ -1,7 +1,10 @@
+import zipfile
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+
 from torchkcreg.io import read_mesh, write_mesh, write_point_cloud_ply
 
 
@@ -17,6 +20,18 @@ def test_a_mesh_comes_back_closed_with_its_volume(tmp_path, plate, suffix):
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(12 * 4 * 90, rel=1e-6)
     assert mesh.extents == pytest.approx([12, 4, 90], rel=1e-6)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("millimeter", 1), ("centimeter", 10), ("inch", 25.4)])
+def test_a_3mf_is_converted_from_the_unit_that_it_names(tmp_path, plate, unit, factor):
+    pytest.importorskip("lxml")
+    plate.apply_scale(0.4)
+    plate.export(tmp_path / "mm.3mf")
+    with zipfile.ZipFile(tmp_path / "mm.3mf") as source, zipfile.ZipFile(tmp_path / "plate.3mf", "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name).replace(b'unit="millimeter"', f'unit="{unit}"'.encode()))
+    mesh = read_mesh(tmp_path / "plate.3mf")
+    assert mesh.extents == pytest.approx([4.8 * factor, 1.6 * factor, 36 * factor], rel=1e-6)
 
 
 def test_several_bodies_are_one_surface(tmp_path, plate):

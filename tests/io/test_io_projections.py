@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
+
 from torchkcreg.geometry import MultisourceScanner
 from torchkcreg.io import read_projections, write_projections
 
@@ -129,7 +130,10 @@ IMAGE = np.ones((2, 3, 4))
         ({"intensity": IMAGE}, "has intensity but no open_beam"),
         ({"other": IMAGE}, "needs either intensity"),
         ({"intensity": IMAGE, "line_integrals": IMAGE, "open_beam": 1.0}, "needs either intensity"),
-        ({"line_integrals": IMAGE[0]}, r"line_integrals must be numbers of shape \(V, rows, cols\), got float64 \(3, 4\)"),
+        (
+            {"line_integrals": IMAGE[0]},
+            r"line_integrals must be numbers of shape \(V, rows, cols\), got float64 \(3, 4\)",
+        ),
         ({"line_integrals": IMAGE[:0]}, r"shape \(V, rows, cols\)"),
         ({"line_integrals": IMAGE * 1j}, "line_integrals must be numbers"),
         ({"line_integrals": IMAGE.astype(np.uint16)}, "look like intensities"),

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+
 from torchkcreg.io import read_points, read_spectrum, write_points, write_spectrum
 from torchkcreg.physics import Spectrum
 
@@ -14,8 +15,11 @@ def test_points_come_back_to_a_millionth_of_a_millimetre(tmp_path):
 
 def test_further_columns_are_written_and_ignored_when_read(tmp_path):
     points = torch.eye(3)
-    write_points(tmp_path / "p.csv", points, columns={"outside": torch.tensor([True, False, True]), "e": torch.ones(3)})
-    assert (tmp_path / "p.csv").read_text().splitlines()[:2] == ["x,y,z,outside,e", "1.000000,0.000000,0.000000,1,1.000000"]
+    write_points(tmp_path / "p.csv", points, outside=torch.tensor([True, False, True]), e=torch.ones(3))
+    assert (tmp_path / "p.csv").read_text().splitlines()[:2] == [
+        "x,y,z,outside,e",
+        "1.000000,0.000000,0.000000,1,1.000000",
+    ]
     assert torch.equal(read_points(tmp_path / "p.csv"), points.double())
 
 
@@ -57,7 +61,7 @@ def test_points_that_are_no_points_are_not_written(tmp_path):
     with pytest.raises(ValueError, match="row 1 is not"):
         write_points(tmp_path / "p.csv", torch.tensor([[0.0, 0, 0], [0, float("nan"), 0]]))
     with pytest.raises(ValueError, match="column outside"):
-        write_points(tmp_path / "p.csv", torch.zeros(2, 3), columns={"outside": torch.zeros(3)})
+        write_points(tmp_path / "p.csv", torch.zeros(2, 3), outside=torch.zeros(3))
     assert list(tmp_path.iterdir()) == []
 
 

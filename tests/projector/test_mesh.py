@@ -143,7 +143,7 @@ def test_a_moving_silhouette_changes_the_sum_as_its_area():
     scale = torch.stack([width, torch.ones_like(width), torch.ones_like(width)])
     total = project_mesh(vertices * scale, faces, MATRIX[None], DET_SHAPE).sum()
     (slope,) = torch.autograd.grad(total, width)
-    assert float(slope) == pytest.approx(float(total), rel=2e-3)
+    assert slope.item() == pytest.approx(total.item(), rel=2e-3)
 
 
 def test_wrong_input_is_refused():

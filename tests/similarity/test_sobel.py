@@ -41,7 +41,7 @@ def test_the_adjoint_is_the_adjoint_of_the_filter_borders_included(size):
 
 
 def test_first_and_second_derivatives_pass_gradcheck_in_both_modes():
-    image = torch.rand(2, 4, 5, dtype=torch.float64, requires_grad=True)
+    image = torch.rand(1, 3, 4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(sobel_gradient, image, check_forward_ad=True, check_batched_grad=True)
     assert torch.autograd.gradgradcheck(lambda x: sobel_gradient(x).square(), image)
 

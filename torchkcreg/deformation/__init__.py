@@ -11,10 +11,12 @@ from torchkcreg.deformation.groups import (
     control_points_from_groups,
     displacement_from_groups,
     group_centers,
+    group_moment_gradients,
     group_moments,
     split_motions,
 )
 from torchkcreg.deformation.penalty import diffusion_penalty, without_rigid
+from torchkcreg.deformation.strain import strain_energy
 
 __all__ = [
     "ControlPointGrid",
@@ -30,9 +32,11 @@ __all__ = [
     "elastic_energy",
     "elastic_stiffness",
     "group_centers",
+    "group_moment_gradients",
     "group_moments",
     "group_rigid_motions",
     "spline_displacement",
     "split_motions",
+    "strain_energy",
     "without_rigid",
 ]

@@ -72,13 +72,13 @@ def cluster_control_points(grid: ControlPointGrid, weights: Tensor, num_groups: 
     groups = torch.zeros_like(loaded)
     extents = [_principal_extent(positions, load)]
     for new in range(1, num_groups):
-        widest = max(range(new), key=lambda g: extents[g])
+        # Rounded, so that equal halves of a symmetric implant are cut in the same order everywhere.
+        widest = max(range(new), key=lambda group: round(extents[group], 6))
         members = (groups == widest).nonzero().squeeze(-1)
         groups[members[_upper_part(positions[members], load[members])]] = new
-        for group in (widest, new):
-            extents_of = groups == group
-            extent = _principal_extent(positions[extents_of], load[extents_of])
-            extents[group : group + 1] = [extent]
+        extents.append(0.0)
+        for part in (widest, new):
+            extents[part] = _principal_extent(positions[groups == part], load[groups == part])
     return groups[torch.cdist(all_positions, positions).argmin(-1)].reshape(grid.shape)
 
 

@@ -69,19 +69,44 @@ def group_moments(
     if num_groups is not None and num_groups != groups:
         raise ValueError(f"labels must hold {num_groups} groups, got {groups}")
     basis = SplineBasis(grid, points, dtype)
+    moments = basis.evaluate(_cell_moments(grid, labels, basis, centers))
+    return moments[:, :groups], moments[:, groups:].unflatten(-1, (groups, 3))
+
+
+def group_moment_gradients(grid: ControlPointGrid, labels: Tensor, points: Tensor) -> Tensor:
+    """Gradients (N, 3, G, 4) of the moments along the grid's axes, 1/mm and 1: of W_g, then of the three of M_g.
+
+    The displacement's gradient is linear in the groups' motions as the displacement is: d u / d x_j = sum_g t_g d_j W_g
+    + (R_g - I) d_j M_g.
+
+    Args:
+        grid: control points.
+        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        points: in the implant's frame, mm, shape (N, 3).
+    """
+    centers = group_centers(grid, labels)
+    basis = SplineBasis(grid, points)
+    features = _cell_moments(grid, labels, basis, centers)
+    orders = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    slopes = torch.stack([basis.evaluate(features, o) / s for o, s in zip(orders, grid.spacing, strict=True)], dim=1)
+    shares, moments = slopes.split([len(centers), 3 * len(centers)], dim=-1)
+    return torch.cat([shares[..., None], moments.unflatten(-1, (-1, 3))], dim=-1)
+
+
+def _cell_moments(grid: ControlPointGrid, labels: Tensor, basis: SplineBasis, centers: Tensor) -> Tensor:
+    """Membership and arm of the CPs of each cell, (num_cells, 64, 4 G): what the moments are sums of."""
     indices, nearest = basis.control_points()
-    member = one_hot(labels.to(indices.device).flatten()[nearest], groups).double()
+    member = one_hot(labels.to(indices.device).flatten()[nearest], len(centers)).double()
     spacing = torch.tensor(grid.spacing, dtype=torch.float64, device=indices.device)
     arms = (indices * spacing)[:, :, None] - centers.to(indices.device)
-    features = torch.cat([member, (member[..., None] * arms).flatten(-2)], dim=-1)
-    moments = basis.evaluate(features.to(basis.eta.dtype))
-    return moments[:, :groups], moments[:, groups:].unflatten(-1, (groups, 3))
+    return torch.cat([member, (member[..., None] * arms).flatten(-2)], dim=-1).to(basis.eta.dtype)
 
 
 def displacement_from_groups(shares: Tensor, moments: Tensor, rotations: Tensor, translations: Tensor) -> Tensor:
     """Displacements (..., N, 3), mm, of nodes whose groups of control points move rigidly, in the grid's axes.
 
-    u = sum_g W_g t_g + (R_g - I) M_g, as one matrix product for all candidates.
+    u = sum_g W_g t_g + (R_g - I) M_g, as a matrix product for all candidates at once. The result of several candidates
+    is a strided view, in which the candidates of one node are neighbours.
 
     Args:
         shares: W of `group_moments`, (N, G).
@@ -89,8 +114,15 @@ def displacement_from_groups(shares: Tensor, moments: Tensor, rotations: Tensor,
         rotations: of the groups about their centres, (..., G, 3, 3).
         translations: of the groups' centres, mm, (..., G, 3).
     """
-    turns = (rotations - torch.eye(3).to(rotations)).mT.flatten(-3, -2)
-    return shares @ translations.to(shares) + moments.flatten(-2) @ turns.to(moments)
+    groups = shares.shape[-1]
+    _check_motions(rotations, translations, groups)
+    candidates = torch.broadcast_shapes(rotations.shape[:-3], translations.shape[:-2])
+    turns = (rotations - torch.eye(3).to(rotations)).mT.expand(*candidates, groups, 3, 3).reshape(-1, 3 * groups, 3)
+    shifts = translations.expand(*candidates, groups, 3).reshape(-1, groups, 3)
+    # All candidates side by side in one wide product: one narrow product each takes five times as long.
+    shifts, turns = (steps.movedim(0, 1).flatten(1).to(shares) for steps in (shifts, turns))
+    u = (shares @ shifts).addmm_(moments.flatten(-2), turns)
+    return u.unflatten(-1, (-1, 3)).movedim(1, 0).reshape(*candidates, *u.shape[:-1], 3)
 
 
 def control_points_from_groups(
@@ -107,11 +139,7 @@ def control_points_from_groups(
         translations: of the groups' centres, mm, (..., G, 3).
     """
     centers = group_centers(grid, labels).to(translations)
-    if rotations.shape[-3:] != (len(centers), 3, 3) or translations.shape[-2:] != (len(centers), 3):
-        raise ValueError(
-            f"rotations and translations must be of {len(centers)} groups, "
-            f"got {tuple(rotations.shape)} and {tuple(translations.shape)}"
-        )
+    _check_motions(rotations, translations, len(centers))
     group = labels.flatten()
     arms = grid.positions().to(translations).reshape(-1, 3) - centers[group]
     turns = (rotations - torch.eye(3).to(rotations))[..., group, :, :]
@@ -135,6 +163,7 @@ def split_motions(
         ValueError: if a fine group is not part of one coarse group.
     """
     parents, children = group_centers(grid, parent_labels), group_centers(grid, child_labels)
+    _check_motions(rotations, translations, len(parents))
     pairs = torch.unique(torch.stack([child_labels.flatten(), parent_labels.flatten()]), dim=1)
     if pairs.shape[1] != len(children):
         raise ValueError(f"child_labels must refine parent_labels, got {pairs.shape[1]} overlaps of {len(children)}")
@@ -149,3 +178,11 @@ def _check_labels(grid: ControlPointGrid, labels: Tensor) -> None:
         raise ValueError(f"labels must be integers of shape {grid.shape}, got {labels.dtype} {tuple(labels.shape)}")
     if int(labels.min()) < 0:
         raise ValueError(f"labels must not be negative, got {int(labels.min())}")
+
+
+def _check_motions(rotations: Tensor, translations: Tensor, num_groups: int) -> None:
+    if rotations.shape[-3:] != (num_groups, 3, 3) or translations.shape[-2:] != (num_groups, 3):
+        raise ValueError(
+            f"rotations and translations must be of {num_groups} groups, "
+            f"got {tuple(rotations.shape)} and {tuple(translations.shape)}"
+        )

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Protocol
 
 import torch
@@ -42,14 +41,6 @@ def bb_rmse(estimated: Tensor, truth: Tensor) -> Tensor:
     return errors.square().mean(-1).sqrt()
 
 
-class Registered(Protocol):
-    """What can be evaluated: a `torchkcreg.registration.RegistrationResult`, or anything else that warps points."""
-
-    gc: Tensor
-    warp: Callable[[Tensor], Tensor]
-    outside: Callable[[Tensor], Tensor]
-
-
 @dataclass(frozen=True)
 class PointMetrics:
     """Errors of a registration at reference points, all lengths in mm.
@@ -72,42 +63,79 @@ class PointMetrics:
     median_mm: float
     max_mm: float
     rmse_xyz_mm: tuple[float, float, float]
-    motion_rms_mm: float | None
-    num_outside: int
-    gc: tuple[float, ...]
+    motion_rms_mm: float | None = None
+    num_outside: int | None = None
+    gc: tuple[float, ...] | None = None
 
-    def as_dict(self) -> dict[str, object]:
-        """The metrics as plain data, for `metrics.json`."""
-        return asdict(self)
+    def to_dict(self) -> dict[str, object]:
+        """The metrics as plain data; what is not known is left out."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+    def __str__(self) -> str:
+        x, y, z = self.rmse_xyz_mm
+        moved = "" if self.motion_rms_mm is None else f"; they moved {self.motion_rms_mm:.3f} mm (RMS)"
+        outside = f"; {self.num_outside} beyond the control-point grid" if self.num_outside else ""
+        return (
+            f"{self.num_points} points: RMSE {self.rmse_mm:.3f} mm (x {x:.3f}, y {y:.3f}, z {z:.3f}), "
+            f"mean {self.mean_mm:.3f}, median {self.median_mm:.3f}, largest {self.max_mm:.3f} mm{moved}{outside}"
+        )
+
+
+def evaluate_points(estimated: Tensor, truth: Tensor, *, start: Tensor | None = None) -> PointMetrics:
+    """Errors of estimated positions of reference points such as BBs.
+
+    Args:
+        estimated: where the registration puts them (N, 3), mm.
+        truth: where they are (N, 3).
+        start: where they were before (N, 3), to tell how far they moved.
+
+    Raises:
+        ValueError: shapes differ, or there is no point.
+
+    >>> print(evaluate_points(torch.zeros(2, 3), torch.tensor([[0.3, 0.0, 0.0], [0.0, 0.0, 0.1]])))
+    2 points: RMSE 0.224 mm (x 0.212, y 0.000, z 0.071), mean 0.200, median 0.200, largest 0.300 mm
+    """
+    estimated, truth = estimated.detach().double(), truth.detach().double().to(estimated.device)
+    if estimated.ndim != 2:
+        raise ValueError(f"estimated must have shape (N, 3), got {tuple(estimated.shape)}")
+    errors = point_errors(estimated, truth)
+    rmse = bb_rmse(estimated, truth)
+    x, y, z = (estimated - truth).square().mean(0).sqrt().tolist()
+    return PointMetrics(
+        num_points=len(errors),
+        rmse_mm=float(rmse),
+        mean_mm=float(errors.mean()),
+        median_mm=float(errors.quantile(0.5)),
+        max_mm=float(errors.max()),
+        rmse_xyz_mm=(x, y, z),
+        motion_rms_mm=None if start is None else float(bb_rmse(start.detach().double(), truth)),
+    )
+
+
+class Registered(Protocol):
+    """What can be evaluated: a `torchkcreg.registration.RegistrationResult`, or anything else that warps points."""
+
+    gc: Tensor
+
+    def warp(self, points: Tensor) -> Tensor:
+        """World positions of points of the implant's frame."""
+
+    def outside(self, points: Tensor) -> Tensor:
+        """True for points where the deformation is only continued."""
 
 
 def evaluate(result: Registered, points: Tensor, truth: Tensor, *, start: Tensor | None = None) -> PointMetrics:
-    """Errors of a registration at reference points such as BBs.
+    """Errors of a registration at reference points such as BBs, with what it says of itself.
 
     Args:
         result: the registration.
-        points: reference points (N, 3) in the implant's frame, on or near the undeformed implant.
+        points: reference points (N, 3) in the implant's frame, on or near the undeformed implant, mm.
         truth: where they are in the world at the time of the projections (N, 3).
         start: where they were before (N, 3), to tell how far they moved.
 
     Raises:
         ValueError: shapes differ, or there is no point.
     """
-    points, truth = points.double(), truth.double()
-    if points.ndim != 2:
-        raise ValueError(f"points must have shape (N, 3), got {tuple(points.shape)}")
-    warped = result.warp(points).to(truth)
-    errors = point_errors(warped, truth)
-    rmse = bb_rmse(warped, truth)
-    x, y, z = (warped - truth).square().mean(0).sqrt().tolist()
-    return PointMetrics(
-        num_points=len(points),
-        rmse_mm=float(rmse),
-        mean_mm=float(errors.mean()),
-        median_mm=float(errors.median()),
-        max_mm=float(errors.max()),
-        rmse_xyz_mm=(x, y, z),
-        motion_rms_mm=None if start is None else float(bb_rmse(start.double(), truth)),
-        num_outside=int(result.outside(points).sum()),
-        gc=tuple(result.gc.tolist()),
-    )
+    points = points.double()
+    metrics = evaluate_points(result.warp(points), truth, start=start)
+    return replace(metrics, num_outside=int(result.outside(points).sum()), gc=tuple(result.gc.tolist()))

@@ -219,6 +219,14 @@ class ConeBeamGeometry(nn.Module):
         det_shape = [count // int(factor) for count in self.det_shape]
         return self._derived(matrices, det_shape=det_shape, pixel_spacing=[d * factor for d in self.pixel_spacing])
 
+    def refined(self, factor: int) -> ConeBeamGeometry:
+        """The geometry of pixels ``factor`` times finer, the inverse of :meth:`bin`: ``u' = factor u + (factor - 1)/2``."""
+        if int(factor) != factor or factor < 1:
+            raise ValueError(f"factor must be a positive integer, got {factor}")
+        matrices = self._rescaled([-(factor - 1) / (2 * factor)] * 2, factor)
+        det_shape = [count * int(factor) for count in self.det_shape]
+        return self._derived(matrices, det_shape=det_shape, pixel_spacing=[d / factor for d in self.pixel_spacing])
+
     def _rescaled(self, start: Sequence[float], factor: float) -> Tensor:
         """Matrices for pixels ``(uv - start) * factor``; start is (v, u)."""
         matrices = self.projection_matrices

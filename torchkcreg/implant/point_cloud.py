@@ -178,7 +178,9 @@ class ImplantPointCloud(nn.Module):
         if int(factor) != factor or factor < 1:
             raise ValueError(f"factor must be a positive integer, got {factor}")
         in_cells = self.points.double() @ torch.linalg.inv(self.cell.double())
-        blocks = torch.floor((in_cells - in_cells.amin(0) + 0.5) / factor).long()
+        # The heaviest node's cell is full, so that it stands at its centre: surface nodes lie anywhere in theirs.
+        lattice = torch.round(in_cells - in_cells[self.masses.argmax()]).long()
+        blocks = torch.div(lattice - lattice.amin(0), factor, rounding_mode="floor")
         size = blocks.amax(0) + 1
         distinct, block = torch.unique(
             (blocks[:, 0] * size[1] + blocks[:, 1]) * size[2] + blocks[:, 2], return_inverse=True

@@ -7,6 +7,7 @@ what it writes is there whole or not at all.
 from .components import ComponentSpec, read_components, write_components
 from .config import read_config, write_config
 from .figures import write_figure
+from .files import read_json, write_json
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .init import read_init, write_init
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
@@ -30,6 +31,7 @@ __all__ = [
     "read_config",
     "read_geometry",
     "read_init",
+    "read_json",
     "read_mesh",
     "read_points",
     "read_projections",
@@ -45,6 +47,7 @@ __all__ = [
     "write_geometry",
     "write_init",
     "write_itk_transform",
+    "write_json",
     "write_mesh",
     "write_point_cloud_ply",
     "write_points",

@@ -19,8 +19,9 @@ _SMALLEST_MM, _LARGEST_MM = 1.0, 1000.0
 
 
 def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
-    """The closed surface of an STL, OBJ, PLY, OFF or 3MF file, in mm as the file has it, oriented outwards.
+    """The closed surface of an STL, OBJ, PLY, OFF or 3MF file, in mm, oriented outwards.
 
+    3MF says its unit and is converted (it needs the package lxml); the others are taken to be in mm.
     Equal vertices are merged, faces that this collapses dropped; several bodies in one file are one surface. A largest
     extent under 1 mm or over 1000 mm gives a warning: the file is probably in metres, or not in mm.
 
@@ -44,6 +45,8 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         triangles = closed_triangles(mesh)
     except ValueError as error:
         raise ValueError(f"mesh file {path}: {error}") from error
+    if suffix == ".3mf" and mesh.units:  # the one format that says its unit
+        triangles = triangles * trimesh.units.unit_conversion(mesh.units, "millimeters")
     closed = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=True)
     _warn_about_size(path, closed)
     return closed

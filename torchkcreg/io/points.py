@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -23,13 +22,13 @@ def read_points(path: str | os.PathLike[str]) -> Tensor:
     return torch.from_numpy(read_table(path, "points", ("x", "y", "z")))
 
 
-def write_points(path: str | os.PathLike[str], points: Tensor, *, columns: Mapping[str, Tensor] | None = None) -> None:
+def write_points(path: str | os.PathLike[str], points: Tensor, **columns: Tensor) -> None:
     """Nothing; writes points as CSV with a header line, in the given order, to a millionth of a mm.
 
     Args:
         path: the file.
         points: (N, 3) in mm.
-        columns: further columns by name, each (N,): flags as 0 and 1, numbers with six decimals.
+        **columns: further columns by name, each (N,): flags as 0 and 1, numbers with six decimals.
 
     Raises:
         ValueError: shapes don't fit, or a point is not finite.
@@ -40,10 +39,10 @@ def write_points(path: str | os.PathLike[str], points: Tensor, *, columns: Mappi
     if not np.isfinite(array).all():
         raise ValueError(f"points must be finite, but row {int(np.argmin(np.isfinite(array).all(axis=1)))} is not")
     texts = [[f"{value:.6f}" for value in row] for row in array.tolist()]
-    for name, column in (columns or {}).items():
+    for name, column in columns.items():
         if column.shape != points.shape[:1]:
             raise ValueError(f"column {name} must have shape ({len(points)},), got {tuple(column.shape)}")
         for row, value in zip(texts, column.tolist()):
             row.append(f"{value:.6f}" if isinstance(value, float) else str(int(value)))
-    lines = [",".join(["x", "y", "z", *(columns or {})]), *(",".join(row) for row in texts)]
+    lines = [",".join(["x", "y", "z", *columns]), *(",".join(row) for row in texts)]
     write_text(path, "\n".join(lines) + "\n")

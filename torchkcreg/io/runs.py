@@ -70,24 +70,18 @@ class RunFolder:
         if overwrite and resume:
             raise ValueError("a run is either overwritten or resumed, not both")
         run = cls(path)
+        is_run = (run.path / CONFIG).is_file()
+        if resume and not is_run:
+            raise FileNotFoundError(f"run folder {run.path} holds no run to resume (no {CONFIG})")
         try:
             run.path.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
             raise NotADirectoryError(f"run folder {run.path} cannot be made: a file is in the way") from error
-        for leftover in run.path.glob(f"{TEMPORARY_PREFIX}*"):  # of a run that was killed while writing
-            leftover.unlink(missing_ok=True)
-        is_run = (run.path / CONFIG).is_file()
-        if resume:
-            if not is_run:
-                raise FileNotFoundError(f"run folder {run.path} holds no run to resume (no {CONFIG})")
-            return run
-        if not any(run.path.iterdir()):
-            return run
-        if not is_run:
+        if not is_run and any(not entry.name.startswith(TEMPORARY_PREFIX) for entry in run.path.iterdir()):
             raise FileExistsError(f"folder {run.path} is not empty and holds no run: choose another one")
-        if not overwrite:
+        if is_run and not (resume or overwrite):
             raise FileExistsError(f"run folder {run.path} holds a run already: overwrite or resume it")
-        run._discard()
+        run._discard(() if resume else RUN_FILES)
         return run
 
     def start(self, config: dict[str, Any]) -> None:
@@ -173,8 +167,10 @@ class RunFolder:
         except ValueError as error:
             raise ValueError(f"deformation file {path}: {' '.join(str(error).split())}") from error
 
-    def _discard(self) -> None:
-        for name in RUN_FILES:
+    def _discard(self, names: tuple[str, ...]) -> None:
+        for leftover in self.path.glob(f"{TEMPORARY_PREFIX}*"):  # of a run that was killed while writing
+            leftover.unlink(missing_ok=True)
+        for name in names:
             (self.path / name).unlink(missing_ok=True)
 
 

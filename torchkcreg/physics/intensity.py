@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d
 
 from torchkcreg.physics.blur import gaussian_kernel
 from torchkcreg.physics.materials import Material, material
@@ -16,10 +17,18 @@ from torchkcreg.physics.transmission import polyenergetic_line_integrals
 class IdentityIntensity(nn.Module):
     """Path lengths as they are, summed over the materials: the model of Cao et al. 2020."""
 
-    def forward(self, path_lengths: Tensor) -> Tensor:
-        """Summed path lengths `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)`."""
-        _check_path_lengths(path_lengths, None)
-        return path_lengths[..., 0, :, :, :] if path_lengths.shape[-4] == 1 else path_lengths.sum(-4)
+    def forward(self, path_lengths: Tensor, *, pooling: int = 1) -> Tensor:
+        """Summed path lengths `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)`, averaged over squares.
+
+        Args:
+            path_lengths: Path lengths, one image a material and view.
+            pooling: Side of the squares of pixels that are averaged.
+        """
+        _check_path_lengths(path_lengths, None, pooling)
+        total = path_lengths[..., 0, :, :, :] if path_lengths.shape[-4] == 1 else path_lengths.sum(-4)
+        if pooling == 1:
+            return total
+        return avg_pool2d(total.flatten(0, -3), pooling).unflatten(0, total.shape[:-2])
 
 
 class PolyenergeticTransmission(nn.Module):
@@ -91,6 +100,8 @@ class PolyenergeticTransmission(nn.Module):
         scatter: Tensor | None = None,
         blur_sigma_px: Tensor | None = None,
         hardness: Tensor | None = None,
+        pooling: int = 1,
+        background: Tensor | None = None,
     ) -> Tensor:
         """Line integrals `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)` in mm.
 
@@ -99,11 +110,17 @@ class PolyenergeticTransmission(nn.Module):
             scatter: Per candidate, in place of the module's own: a scalar or of the shape of the candidate axes.
             blur_sigma_px: As `scatter`.
             hardness: As `scatter`.
+            pooling: Transmissions are averaged over squares of this many pixels a side after the blur. Path lengths on
+                pixels finer than the detector's follow sharp edges better: an average of exponentials is not the
+                exponential of the average.
+            background: Share of the beam that everything but the known components lets through, b of shape
+                (V, rows, cols) after pooling: `b blur(...)` in place of `blur(...)`. One if None.
 
         Raises:
-            ValueError: If the path lengths' M is not the number of materials, or an override fits no candidate axis.
+            ValueError: If the path lengths' M is not the number of materials, or an override fits no candidate axis, or
+                pooling does not divide the images.
         """
-        _check_path_lengths(path_lengths, len(self.attenuation))
+        _check_path_lengths(path_lengths, len(self.attenuation), pooling)
         leading = path_lengths.shape[:-4]
         # the few numbers a candidate in the module's own precision; the images in theirs
         hardness = _per_candidate("hardness", self.hardness, hardness, leading)
@@ -111,8 +128,10 @@ class PolyenergeticTransmission(nn.Module):
         floor = _per_candidate("scatter", self.scatter, scatter, leading)
         weights = torch.softmax(self.weights.log() - hardness[:, None] * self.aluminium, dim=-1)
         flat = path_lengths.reshape(-1, *path_lengths.shape[-4:])
-        result = polyenergetic_line_integrals(flat, self.attenuation, weights, gaussian_kernel(sigma), floor)
-        return result.reshape(*leading, *path_lengths.shape[-3:])
+        result = polyenergetic_line_integrals(
+            flat, self.attenuation, weights, gaussian_kernel(sigma), floor, pooling, background
+        )
+        return result.reshape(*leading, *result.shape[-3:])
 
     def extra_repr(self) -> str:
         """Materials and number of energies."""
@@ -124,13 +143,15 @@ def _parameter(value: float) -> nn.Parameter:
     return nn.Parameter(torch.tensor(float(value), dtype=torch.float64))
 
 
-def _check_path_lengths(path_lengths: Tensor, num_materials: int | None) -> None:
-    """Raise ValueError unless the path lengths have the shape (..., M, V, rows, cols)."""
+def _check_path_lengths(path_lengths: Tensor, num_materials: int | None, pooling: int) -> None:
+    """Raise ValueError unless the path lengths have the shape (..., M, V, rows, cols), divided by pooling."""
     if path_lengths.dim() < 4 or num_materials not in (None, path_lengths.shape[-4]):
         expected = "M" if num_materials is None else num_materials
         raise ValueError(
             f"path_lengths must have shape (..., {expected}, V, rows, cols), got {tuple(path_lengths.shape)}"
         )
+    if pooling < 1 or path_lengths.shape[-1] % pooling or path_lengths.shape[-2] % pooling:
+        raise ValueError(f"pooling must divide rows and cols, got {pooling} for {tuple(path_lengths.shape[-2:])}")
 
 
 def _per_candidate(name: str, own: Tensor, override: Tensor | None, leading: torch.Size) -> Tensor:

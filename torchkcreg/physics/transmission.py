@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import avg_pool2d
 
 from torchkcreg.physics.blur import convolve, convolve_adjoint, kernel_gradient
 
@@ -14,11 +15,17 @@ BLOCK_PIXELS = 65536  # exponentials are taken in blocks that stay in a core's c
 
 
 def polyenergetic_line_integrals(
-    path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor
+    path_lengths: Tensor,
+    attenuation: Tensor,
+    weights: Tensor,
+    kernel: Tensor,
+    scatter: Tensor,
+    pooling: int = 1,
+    background: Tensor | None = None,
 ) -> Tensor:
     """Line integrals `(K, V, rows, cols)` of materials' path lengths `(K, M, V, rows, cols)`.
 
-    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`, candidate by candidate; only images of the size of
+    `y = -ln(b blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`, candidate by candidate; only images of the size of
     the result are kept for the gradient, whatever the number of energies.
 
     Args:
@@ -27,11 +34,16 @@ def polyenergetic_line_integrals(
         weights: Weights of the energies, `(K, energies)`.
         kernel: One-dimensional blur kernels, `(K, odd)`, applied along rows and columns.
         scatter: Scatter floors in units of the open beam, `(K,)`.
+        pooling: Blurred transmissions are averaged over squares of this many pixels a side, which divides the images.
+        background: Share b of the beam that what is not modelled lets through, `(V, rows, cols)` after pooling; no
+            gradient. All of it if None.
 
     Returns:
         Differentiable once, in everything but the attenuation.
     """
-    return _PolyenergeticLineIntegrals.apply(path_lengths, attenuation, weights, kernel, scatter)
+    return _PolyenergeticLineIntegrals.apply(
+        path_lengths, attenuation, weights, kernel, scatter, pooling, background
+    )
 
 
 class _PolyenergeticLineIntegrals(torch.autograd.Function):
@@ -39,18 +51,29 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor
+        ctx: Any,
+        path_lengths: Tensor,
+        attenuation: Tensor,
+        weights: Tensor,
+        kernel: Tensor,
+        scatter: Tensor,
+        pooling: int,
+        background: Tensor | None,
     ) -> Tensor:
-        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter)
+        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter, background)
+        ctx.pooling = pooling
         coefficients = attenuation.tolist()
         num_candidates, _, *image_shape = path_lengths.shape
-        result = path_lengths.new_empty(num_candidates, *image_shape)
+        views, rows, cols = image_shape
+        result = path_lengths.new_empty(num_candidates, views, rows // pooling, cols // pooling)
         settings = zip(weights.tolist(), kernel.tolist(), scatter.tolist())
         for candidate, (shares, blur, floor) in enumerate(settings):
             lengths = path_lengths[candidate].flatten(1)
             signal = transmitted(lengths, coefficients, shares).view(image_shape)
             for view in range(image_shape[0]):
-                blurred = convolve(convolve(signal[view], blur, -2), blur, -1)
+                blurred = _pooled(convolve(convolve(signal[view], blur, -2), blur, -1), pooling)
+                if background is not None:
+                    blurred = blurred * background[view]
                 out = result[candidate, view]
                 _add_floor(blurred, floor, out=out).log_().neg_().add_(_log1p(floor))
         return result
@@ -58,9 +81,9 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        path_lengths, attenuation, weights, kernel, scatter = ctx.saved_tensors
+        path_lengths, attenuation, weights, kernel, scatter, background = ctx.saved_tensors
         coefficients = attenuation.tolist()
-        wants_lengths, _, wants_weights, wants_kernel, wants_scatter = ctx.needs_input_grad
+        wants_lengths, _, wants_weights, wants_kernel, wants_scatter, *_ = ctx.needs_input_grad
         grad_lengths = torch.empty_like(path_lengths) if wants_lengths else None
         grad_weights, grad_kernel, grad_scatter = [], [], []
         settings = zip(weights.tolist(), kernel.tolist(), scatter.tolist())
@@ -68,10 +91,15 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
             lengths = path_lengths[candidate].flatten(1)
             signal = transmitted(lengths, coefficients, shares).view(path_lengths.shape[2:])
             along_rows = convolve(signal, blur, -2)
-            blurred = convolve(along_rows, blur, -1)
+            blurred = _pooled(convolve(along_rows, blur, -1), ctx.pooling)
+            if background is not None:
+                blurred = blurred * background
             grad_signal = _add_floor(blurred, floor, out=blurred).reciprocal_().mul_(upstream[candidate]).neg_()
             if wants_scatter:
                 grad_scatter.append(float(grad_signal.sum()) + float(upstream[candidate].sum()) / (1 + floor))
+            if background is not None:
+                grad_signal = grad_signal * background
+            grad_signal = _spread(grad_signal, ctx.pooling)
             grad_rows = convolve_adjoint(grad_signal, blur, -1)
             if wants_kernel:
                 radius = len(blur) // 2
@@ -87,6 +115,8 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
             weights.new_tensor(grad_weights) if wants_weights else None,
             kernel.new_tensor(grad_kernel) if wants_kernel else None,
             scatter.new_tensor(grad_scatter) if wants_scatter else None,
+            None,
+            None,
         )
 
 
@@ -125,6 +155,18 @@ def _transmission_gradient(
                 for material, coefficients in enumerate(attenuation):
                     out[material, start:stop].add_(passed, alpha=-weight * coefficients[energy])
     return grad_weights
+
+
+def _pooled(images: Tensor, pooling: int) -> Tensor:
+    """Images `(..., rows, cols)` averaged over squares of pixels."""
+    return images if pooling == 1 else avg_pool2d(images.unsqueeze(0), pooling).squeeze(0)
+
+
+def _spread(images: Tensor, pooling: int) -> Tensor:
+    """The adjoint of `_pooled`."""
+    if pooling == 1:
+        return images
+    return (images / pooling**2).repeat_interleave(pooling, -2).repeat_interleave(pooling, -1)
 
 
 def _add_floor(signal: Tensor, floor: float, *, out: Tensor) -> Tensor:

@@ -1,11 +1,13 @@
 """Projectors: path length in mm through an implant, for each pixel of each view.
 
-`project_points` draws a point cloud, node by node, with footprints that leave no stripes.
+`project_points` draws a point cloud, node by node, with footprints that leave no stripes; `project_mesh` draws a closed
+triangle mesh, exactly.
 """
 
 from __future__ import annotations
 
 from .footprint import Footprint, cell_footprint
+from .mesh import project_mesh
 from .point_cloud import PointCloudProjector, project_points
 
-__all__ = ["Footprint", "PointCloudProjector", "cell_footprint", "project_points"]
+__all__ = ["Footprint", "PointCloudProjector", "cell_footprint", "project_mesh", "project_points"]

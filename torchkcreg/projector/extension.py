@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -12,7 +14,11 @@ PACKAGE = Path(__file__).resolve().parent.parent
 SOURCES = ("csrc/ops.cpp", "csrc/cpu/point_drr.cpp")
 # setup.py reads these too. The target version lets one build serve torch 2.10 and every later release.
 DEFINES = ("-DTORCH_TARGET_VERSION=0x020a000000000000",)
-COMPILE_FLAGS = ("-O3", "-std=c++17", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-Wno-psabi")
+COMPILE_FLAGS = (
+    ("/O2", "/std:c++17")
+    if os.name == "nt"
+    else ("-O3", "-std=c++17", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-Wno-psabi")
+)
 
 
 @functools.lru_cache(maxsize=1)
@@ -25,12 +31,10 @@ def unavailable_reason() -> str | None:
     """
     reasons = []
     for load in (_load_built, _load_compiled):
-        try:
-            load()
+        failure = _failure_of(load)
+        if failure is None:
             return None
-        except Exception as error:  # whatever the loader, compiler or cache throws, there is a reference to fall back on
-            lines = str(error).strip().splitlines() or [type(error).__name__]
-            reasons.append(lines[0])
+        reasons.append(failure)
     reason = "; ".join(reasons)
     warnings.warn(
         f"torchkcreg runs on its slow torch reference, because its C++ kernels are not available ({reason}). Install a "
@@ -39,6 +43,15 @@ def unavailable_reason() -> str | None:
         stacklevel=2,
     )
     return reason
+
+
+def _failure_of(load: Callable[[], None]) -> str | None:
+    try:
+        load()
+    except Exception as error:  # loaders, compilers and caches fail in many ways; there is always the reference
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        return lines[0]
+    return None
 
 
 def _load_built() -> None:

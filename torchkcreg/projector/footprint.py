@@ -54,12 +54,12 @@ def cell_footprint(
 ) -> Footprint:
     """Footprint of the nodes of a lattice: the projection of their cell, box-filtered by the pixel.
 
-    Near a block's centroid a projection is affine, and takes the edges ``a_i`` of the cell to ``e_i = J a_i`` pixels. The
-    image of a homogeneous cell is then the box spline of ``e_1, e_2, e_3``, and its average over a pixel has the Fourier
-    transform ``prod_i sinc(f . e_i) * sinc(f_u) sinc(f_v)`` with f in cycles per pixel. Sampled at multiples of ``1 / T``
-    and transformed back it gives the footprint at ``1 / R`` of a pixel. A box of ``2 / R`` pixels (Lanczos' sigma factors)
-    keeps the truncated series from ringing where cells are much smaller than pixels. Cells that tile space have
-    footprints that tile the image: no stripes.
+    Near a block's centroid a projection is affine, and takes the edges ``a_i`` of the cell to ``e_i = J a_i`` pixels.
+    The image of a homogeneous cell is then the box spline of ``e_1, e_2, e_3``, and its average over a pixel has the
+    Fourier transform ``prod_i sinc(f . e_i) * sinc(f_u) sinc(f_v)`` with f in cycles per pixel. Sampled at multiples of
+    ``1 / T`` and transformed back it gives the footprint at ``1 / R`` of a pixel. A box of ``2 / R`` pixels (Lanczos'
+    sigma factors) keeps the truncated series from ringing where cells are much smaller than pixels. Cells that tile
+    space have footprints that tile the image: no stripes.
 
     Args:
         points: nodes in world mm, shape (..., N, 3). Leading axes (candidates) are averaged.
@@ -72,7 +72,7 @@ def cell_footprint(
         The footprint, in the dtype and on the device of the points, without gradient.
 
     Raises:
-        ValueError: where shapes don't fit, or cells project to more than 64 pixels.
+        ValueError: where shapes or devices don't fit, or cells project to more than 64 pixels.
 
     >>> P = torch.tensor([[[1000.0, 0, 0, 0], [0, 1000, 0, 0], [0, 0, 1, 500]]])
     >>> footprint = cell_footprint(torch.zeros(5, 3), 0.25 * torch.eye(3), P)
@@ -100,6 +100,9 @@ def _check(points: Tensor, cell: Tensor, matrices: Tensor, block_size: int, phas
     num_blocks = math.ceil(points.shape[-2] / block_size)
     if tuple(cell.shape) not in ((3, 3), (num_blocks, 3, 3)):
         raise ValueError(f"cell must have shape (3, 3) or ({num_blocks}, 3, 3), got {tuple(cell.shape)}")
+    for name, tensor in (("cell", cell), ("projection_matrices", matrices)):
+        if tensor.device != points.device:
+            raise ValueError(f"{name} must be on the points' device {points.device}, got {tensor.device}")
     if not torch.isfinite(cell).all():
         raise ValueError("cell must be finite")
 
@@ -144,32 +147,52 @@ def _num_taps(edges: Tensor, phases: int) -> int:
 
 def _tabulate(edges: Tensor, taps: int, phases: int) -> Tensor:
     """Tables (n, R + 1, R + 1, T, T) of the footprints with projected edges (n, 3, 2)."""
+    image = _periodic_footprint(edges, taps, phases).flatten(-2)
+    table = image.index_select(-1, _tap_index(taps, phases, edges.device))
+    return table.unflatten(-1, (phases + 1, phases + 1, taps, taps))
+
+
+def _periodic_footprint(edges: Tensor, taps: int, phases: int) -> Tensor:
+    """Footprints (n, T R, T R) at every 1 / R pixel, centred on entry 0 and repeated with a period of T pixels.
+
+    A footprint is symmetric about its node, so its transform F is real and even. With ``f_u, f_v >= 0`` and
+    ``F' = F(f_u, -f_v)`` the footprint at d is the sum of ``(F + F') cos cos - (F - F') sin sin`` over frequencies.
+    """
     even, odd, angle_u, angle_v = _transform(taps, phases, edges.dtype, edges.device)
-    # Footprints are symmetric about the node, so their transform F is real, and F(-f) = F(f). With f_u, f_v >= 0 and
-    # F' = F(f_u, -f_v): f(d) = sum (F + F') cos cos - (F - F') sin sin.
-    mirrored = torch.stack([edges, edges * edges.new_tensor([1.0, -1.0])], dim=1)
-    spectrum: Tensor | None = None
-    for edge in mirrored.unbind(2):
-        angle = edge[..., 1, None, None] * angle_v + edge[..., 0, None, None] * angle_u
-        angle += 1e-20  # changes nothing but a zero, where sin(x) / x is one
-        factor = torch.sin(angle).div_(angle)
-        spectrum = factor if spectrum is None else spectrum.mul_(factor)
-    plus, minus = spectrum.unbind(1)
-    half = torch.stack([plus + minus, plus - minus], dim=1) @ torch.stack([even, -odd])
-    table = torch.cat([even, odd]).mT @ half.flatten(1, 2)
-    return table.unflatten(2, (phases + 1, taps)).unflatten(1, (phases + 1, taps)).transpose(2, 3).contiguous()
+    signs = edges.new_tensor([[1.0, 1.0], [1.0, -1.0]])[:, None, None]
+    first, second, third = (_sinc(edge, angle_u, angle_v) for edge in (signs * edges).unbind(2))
+    plus, minus = first.mul_(second).mul_(third)
+    half = torch.cat([(plus + minus) @ even, (minus - plus) @ odd], dim=1)
+    return torch.cat([even, odd]).mT @ half
+
+
+def _sinc(edge: Tensor, angle_u: Tensor, angle_v: Tensor) -> Tensor:
+    """``sin(x) / x`` for x = pi f . e with edges e (..., 2), shape (..., f_v, f_u)."""
+    angle = edge[..., 1, None, None] * angle_v + edge[..., 0, None, None] * angle_u
+    angle += 1e-20  # changes nothing but a zero, where sin(x) / x is one
+    return torch.sin(angle).div_(angle)
 
 
 @functools.lru_cache(maxsize=8)
 def _transform(taps: int, phases: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
-    """Cosine and sine transforms (frequencies, (R + 1) T) along one axis, filtered; angles along u and v for sin(x) / x."""
-    frequency = torch.arange(taps * phases // 2, dtype=torch.float64, device=device) / taps
-    # Pixel box and Lanczos box; both are even, like the weight 2 of all but the zero frequency (halved: see F + F').
+    """Filtered cosine and sine transforms (frequencies, T R) along an axis; angles of sin(x) / x along u and v."""
+    size = taps * phases
+    frequency = torch.arange(size // 2, dtype=torch.float64, device=device) / taps
+    # Pixel box, Lanczos box, and weights for half a plane: 2 where f_u > 0, and 1 / 2 where f_v = 0, as F = F' there.
     window = torch.sinc(frequency) * torch.sinc(2 * frequency / phases) / taps * math.sqrt(2)
     window[0] /= 2
-    phase = torch.arange(phases + 1, dtype=torch.float64, device=device) / phases
-    tap = torch.arange(taps, dtype=torch.float64, device=device) - (taps // 2 - 1)
-    offset = 2 * math.pi * frequency[:, None] * (tap - phase[:, None]).flatten()
-    even, odd = window[:, None] * torch.cos(offset), window[:, None] * torch.sin(offset)
-    angle = math.pi * frequency
-    return even.to(dtype), odd.to(dtype), angle.to(dtype), angle[:, None].to(dtype)
+    angle = 2 * math.pi * frequency[:, None] * torch.arange(size, dtype=torch.float64, device=device) / phases
+    even, odd = window[:, None] * torch.cos(angle), window[:, None] * torch.sin(angle)
+    along = math.pi * frequency
+    return even.to(dtype), odd.to(dtype), along.to(dtype), along[:, None].to(dtype)
+
+
+@functools.lru_cache(maxsize=8)
+def _tap_index(taps: int, phases: int, device: torch.device) -> Tensor:
+    """Where entry (pv, pu, tv, tu) of a table lies in a flattened periodic footprint."""
+    size = taps * phases
+    phase = torch.arange(phases + 1, device=device)
+    first = phases * (taps // 2 - 1 - torch.arange(taps, device=device))
+    # Node minus pixel, which by symmetry does as well as pixel minus node.
+    index = (phase[:, None] + first) % size
+    return (index[:, None, :, None] * size + index[None, :, None, :]).flatten()

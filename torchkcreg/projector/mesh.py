@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 MAX_PAIRS = 1 << 20  # (triangle, pixel) pairs looked at together
-MAX_CLIPPED_PAIRS = 1 << 16  # pairs clipped together: what they need stays in a core's cache
+MAX_CLIPPED_PAIRS = 1 << 14  # pairs clipped together: what they need stays in a core's cache
 
 
 def project_mesh(vertices: Tensor, faces: Tensor, projection_matrices: Tensor, det_shape: tuple[int, int]) -> Tensor:

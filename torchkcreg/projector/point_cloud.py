@@ -22,13 +22,13 @@ def project_points(
     """Path length in mm through a point cloud, averaged over each pixel, for each view and candidate.
 
     A node of volume ``V_n`` at depth d spreads its footprint, which sums to one over the pixels, with the amplitude
-    ``V_n |det M| |M^-1 (u, v, 1)| / d^2`` where ``P = [M | m]``. That is ``V_n`` times the squared ratio of the distances
-    from source to pixel and from source to node, over pixel area times the cosine of the obliquity. So the DRR of a
-    lattice that fills a body is the body's path length. Nodes behind the source or with NaN coordinates are skipped, and
-    a footprint that leaves the detector loses just that part.
+    ``V_n |det M| |M^-1 (u, v, 1)| / d^2`` where ``P = [M | m]``. That is ``V_n`` times the squared ratio of the
+    distances from source to pixel and from source to node, over pixel area times the cosine of the obliquity. So the
+    DRR of a lattice that fills a body is the body's path length. Nodes behind the source or with NaN coordinates are
+    skipped, and a footprint that leaves the detector loses just that part.
 
-    Differentiable in points, masses and projection matrices; the shape of the footprint counts as constant. Two candidates
-    differ in their points only. Where the points' dtype is float32 the result is float32, whatever the matrices' dtype.
+    Differentiable in points, masses and projection matrices; the shape of the footprint counts as constant. The images
+    have the dtype of the points, whatever that of the matrices.
 
     Args:
         points: nodes in world mm, shape (..., N, 3); leading axes are candidates. Neighbours in memory should be
@@ -38,7 +38,8 @@ def project_points(
         det_shape: (rows, cols) of the detector.
         cell: edge vectors (rows) of the cell that a node stands for, in world mm; one matrix, or one for each block of
             8192 nodes. Either `cell` or `footprint`.
-        footprint: ready-made table, to reuse while poses change little.
+        footprint: ready-made, to reuse for poses up to some 5 degrees off: the path lengths stay right, stripes stay
+            below 0.2 %.
         backend: "auto" (C++ on the CPU if it can be had, else torch), "cpp" or "torch". All give the same numbers.
 
     Returns:
@@ -57,10 +58,10 @@ def project_points(
     """
     _check_points(points, masses, projection_matrices, det_shape)
     choose_backend(points, backend)  # a wrong name should not wait for the footprint
-    if (cell is None) == (footprint is None):
-        raise ValueError("give either cell or footprint")
-    if footprint is None:
+    if footprint is None and cell is not None:
         footprint = cell_footprint(points, cell, projection_matrices)
+    elif footprint is None or cell is not None:
+        raise ValueError("give either cell or footprint")
     _check_footprint(footprint, points, projection_matrices)
 
     rows, cols = det_shape

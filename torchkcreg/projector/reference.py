@@ -23,8 +23,8 @@ def splat_points(
     values are the bilinear interpolation of the table in the node's sub-pixel position. Nodes behind the source or with
     NaN coordinates are skipped; pixels beyond the detector are lost.
 
-    Differentiable in points, masses and matrices by autograd; the table is a constant. Any device; sums on a GPU are not
-    in a fixed order.
+    Differentiable in points, masses and matrices by autograd; the table is a constant. Any device; on a GPU the order
+    of the sums, so the last bits, may differ from run to run.
     """
     images = []
     for candidate in points:

@@ -17,13 +17,17 @@ class Stage(BaseModel):
     Attributes:
         groups: Number of control-point groups; one group is a rigid registration of the whole implant.
         bin: Detector pixels are averaged in squares of this side.
+        oversampling: DRRs are rendered on pixels this many times finer and averaged as intensities: the mean of
+            exponentials is not the exponential of the mean, and depth hangs on the difference.
         pitch_factor: The implant's nodes are merged on a lattice this many times coarser.
         optimizer: "gauss-newton", "cmaes" or "adam".
         iterations: At most this many iterations (generations of CMA-ES).
         tolerance: The stage ends when an iteration moves the implant by less, mm (CMA-ES: the spread of a generation).
         step_mm: Initial step: CMA-ES standard deviation, Adam learning rate, largest Gauss-Newton step.
         population: Candidates of a CMA-ES generation.
-        margin_mm: What is seen around the implant's projection, mm at the detector.
+        margin_mm: What is seen around the implant's projection, mm at the detector; None: the whole detector.
+        background: Before the stage, what the model lacks (bone, water) is estimated as a smooth attenuation, and DRRs
+            include it.
         estimate: Parameters of the intensity model that are estimated along.
     """
 
@@ -31,13 +35,15 @@ class Stage(BaseModel):
 
     groups: int = Field(1, ge=1, le=64)
     bin: int = Field(1, ge=1, le=64)
+    oversampling: int = Field(2, ge=1, le=8)
     pitch_factor: int = Field(1, ge=1, le=16)
     optimizer: OptimizerName = "gauss-newton"
     iterations: int = Field(20, ge=1)
     tolerance: float = Field(0.002, gt=0)
     step_mm: float = Field(1.0, gt=0)
     population: int = Field(40, ge=4)
-    margin_mm: float = Field(6.0, ge=0)
+    margin_mm: float | None = Field(6.0, ge=0)
+    background: bool = False
     estimate: tuple[NuisanceName, ...] = ()
 
 
@@ -49,7 +55,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
     * "adam": the Gauss-Newton schedule with Adam in the place of Gauss-Newton.
     """
     physics: tuple[NuisanceName, ...] = ("scatter", "blur")
-    start = Stage(bin=8, pitch_factor=4, optimizer="cmaes", iterations=60, tolerance=0.1, step_mm=2.0, population=16, margin_mm=25.0)
+    start = Stage(bin=8, pitch_factor=4, optimizer="cmaes", iterations=60, tolerance=0.1, step_mm=2.0, population=16, margin_mm=25.0, oversampling=1)
     if preset == "paper":
         shared = {"optimizer": "cmaes", "iterations": 400, "population": 40}
         return (
@@ -89,6 +95,7 @@ class RegistrationConfig(BaseModel):
         stiffness: Weight of the elastic energy of the implant's own material.
         scatter: Initial scatter floor, as a fraction of the open beam.
         blur_px: Initial standard deviation of the detector's blur, pixels.
+        background_mm: Smoothness of the estimated background, standard deviation in mm at the detector.
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp", "triton" or "torch".
@@ -107,6 +114,7 @@ class RegistrationConfig(BaseModel):
     stiffness: float = Field(0.0, ge=0)
     scatter: float = Field(0.05, ge=0, lt=1)
     blur_px: float = Field(0.7, ge=0)
+    background_mm: float = Field(4.0, gt=0)
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
     backend: Literal["auto", "cpp", "triton", "torch"] = "auto"

@@ -18,6 +18,8 @@ class RegistrationData:
         geometry: V views.
         line_integrals: -ln(I / I0), shape (V, rows, cols).
         mask: True where a pixel counts, shape (V, rows, cols); all pixels when None was given.
+        background: Share of the beam that everything but the known components lets through, shape (V, rows, cols);
+            None where nothing is known of it.
 
     Raises:
         ValueError: If the views or the pixels of geometry and images differ, or no pixel is left.
@@ -26,6 +28,7 @@ class RegistrationData:
     geometry: ConeBeamGeometry
     line_integrals: Tensor
     mask: Tensor | None = None
+    background: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.line_integrals.shape)
@@ -52,7 +55,8 @@ class RegistrationData:
 
     def select(self, views: list[int]) -> RegistrationData:
         """The given views alone, in the given order."""
-        return RegistrationData(self.geometry.select(views), self.line_integrals[views], self.mask[views])
+        background = None if self.background is None else self.background[views]
+        return RegistrationData(self.geometry.select(views), self.line_integrals[views], self.mask[views], background)
 
     def binned(self, factor: int) -> RegistrationData:
         """Data on pixels ``factor`` times as large: transmissions are averaged over the pixels that count.
@@ -69,7 +73,8 @@ class RegistrationData:
         share = mean(self.mask.float())
         transmission = mean(torch.exp(-self.line_integrals) * self.mask) / share.clamp_min(1e-6)
         line_integrals = -torch.log(transmission.clamp_min(1e-6))
-        return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5)
+        background = None if self.background is None else mean(self.background)
+        return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5, background)
 
     def windowed(self, points: Tensor, margin_px: float) -> RegistrationData:
         """Data cropped, view by view, to the projection of ``points`` and a margin.
@@ -97,10 +102,13 @@ class RegistrationData:
         matrices = self.geometry.projection_matrices.clone()
         images = self.line_integrals.new_zeros((self.num_views, size_v, size_u))
         mask = torch.zeros_like(images, dtype=torch.bool)
+        background = None if self.background is None else torch.ones_like(images)
         for view, (u0, v0) in enumerate(low.tolist()):
             height, width = min(size_v, rows - v0), min(size_u, cols - u0)
             images[view, :height, :width] = self.line_integrals[view, v0 : v0 + height, u0 : u0 + width]
             mask[view, :height, :width] = self.mask[view, v0 : v0 + height, u0 : u0 + width]
+            if background is not None:
+                background[view, :height, :width] = self.background[view, v0 : v0 + height, u0 : u0 + width]
             matrices[view, 0] -= u0 * matrices[view, 2]
             matrices[view, 1] -= v0 * matrices[view, 2]
         geometry = ConeBeamGeometry(
@@ -110,4 +118,4 @@ class RegistrationData:
             sources=self.geometry.sources,
             angles_deg=self.geometry.angles_deg,
         )
-        return RegistrationData(geometry, images, mask)
+        return RegistrationData(geometry, images, mask, background)

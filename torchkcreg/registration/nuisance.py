@@ -22,11 +22,11 @@ class Nuisance:
     Args:
         intensity: The model; one without the named parameters (the identity) has nothing to estimate.
         names: Parameters to estimate.
-        bin: Pixels are this many times the full detector's; the model keeps its blur in the latter.
+        pixel_size: Of the images the model sees, in the detector's pixels; the model keeps its blur in the latter.
     """
 
-    def __init__(self, intensity: nn.Module, names: Sequence[str], bin: int) -> None:
-        self.intensity, self.bin = intensity, bin
+    def __init__(self, intensity: nn.Module, names: Sequence[str], pixel_size: float) -> None:
+        self.intensity, self.pixel_size = intensity, pixel_size
         self.names = [name for name in names if hasattr(intensity, _PARAMETERS[name][0])]
         table = [_PARAMETERS[name] for name in self.names]
         self.attributes = [row[0] for row in table]
@@ -52,9 +52,9 @@ class Nuisance:
     def __call__(self, steps: Tensor) -> dict[str, Tensor]:
         """Keyword arguments of the intensity model, each of shape (K,); the blur in the images' own pixels."""
         values = dict(zip(self.attributes, self.values(steps).unbind(-1), strict=True))
-        if self.bin > 1 and hasattr(self.intensity, "blur_sigma_px"):
+        if hasattr(self.intensity, "blur_sigma_px"):
             blur = values.get("blur_sigma_px", self.intensity.blur_sigma_px.detach().expand(len(steps)))
-            values["blur_sigma_px"] = blur / self.bin
+            values["blur_sigma_px"] = blur / self.pixel_size
         return {name: value.float() for name, value in values.items()}
 
     @torch.no_grad()

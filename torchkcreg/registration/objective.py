@@ -11,7 +11,9 @@ from torchkcreg.deformation import (
     control_points_from_groups,
     diffusion_penalty,
     group_centers,
+    group_moment_gradients,
     group_moments,
+    strain_energy,
 )
 from torchkcreg.geometry import fit_rigid, transform_points
 from torchkcreg.projector import cell_footprint, project_points
@@ -47,7 +49,7 @@ class StageObjective:
         self.labels = cluster_control_points(grid, self.weights, stage.groups)
         self._prepare_motion(implant)
         self._prepare_images(implant, data)
-        self.nuisance = Nuisance(scene.intensity, stage.estimate, stage.bin)
+        self.nuisance = Nuisance(scene.intensity, stage.estimate, stage.bin / stage.oversampling)
         self.num_parameters = self.motion.num_parameters + self.nuisance.num_parameters
 
     # -- set-up ----------------------------------------------------------------------------------------------------
@@ -61,6 +63,8 @@ class StageObjective:
             positions.reshape(-1, 3), phi.reshape(-1, 3), self.labels.flatten(), self.weights.flatten(), centers
         )
         self.nodes = self._features(implant.points)
+        self.solid = implant.coarsened(max(1, 8 // self.stage.pitch_factor))
+        self.slopes = group_moment_gradients(grid, self.labels, self.solid.points.double()).flatten(-2)
         self.followed = [self._features(points, torch.float64) for points in self.scene.followed]
 
     def _features(self, points: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
@@ -80,10 +84,11 @@ class StageObjective:
             masses = torch.cat([*([implant.masses] if holds_implant else []), *(c.masses for c in own)])
             self.clouds.append((holds_implant, members, [c.points for c in own], masses.float()))
         spacing = data.geometry.pixel_spacing[1] * stage.bin
-        binned = data.binned(stage.bin)
-        points = self.world_points(start)
-        self.data = binned.windowed(torch.cat([p[0] for p in points]), stage.margin_mm / spacing)
-        self.matrices = self.data.geometry.projection_matrices.float()
+        self.data, points = data.binned(stage.bin), self.world_points(start)
+        if stage.margin_mm is not None:
+            self.data = self.data.windowed(torch.cat([p[0] for p in points]), stage.margin_mm / spacing)
+        fine = self.data.geometry.refined(stage.oversampling)
+        self.matrices, self.det_shape = fine.projection_matrices.float(), fine.det_shape
         self.similarity = GradientCorrelation(self.data.line_integrals, self.data.mask)
         rotation = self.scene.implant_to_world[:3, :3].float()
         cell = implant.cell.float() @ rotation.T
@@ -120,26 +125,39 @@ class StageObjective:
         moved = self._displace(self.followed[index], coefficients)
         return fit_rigid(self.scene.followed[index].double().expand_as(moved), moved)
 
-    def line_integrals(self, parameters: Tensor) -> Tensor:
-        """DRRs (K, V, rows, cols) of candidates (K, D)."""
+    def path_lengths(self, parameters: Tensor) -> Tensor:
+        """Path lengths (K, M, V, rows, cols) of candidates (K, D) on the oversampled pixels, mm."""
         paths = [
             project_points(
-                points, cloud[3], self.matrices, self.data.geometry.det_shape, footprint=footprint,
-                backend=self.config.backend,
+                points, cloud[3], self.matrices, self.det_shape, footprint=footprint, backend=self.config.backend
             )
             for points, cloud, footprint in zip(self.world_points(parameters), self.clouds, self.footprints, strict=True)
-        ]  # fmt: skip
-        return self.scene.intensity(torch.stack(paths, dim=-4), **self.nuisance(parameters[:, self.motion.num_parameters :]))
+        ]
+        return torch.stack(paths, dim=-4)
+
+    def line_integrals(self, parameters: Tensor) -> Tensor:
+        """DRRs (K, V, rows, cols) of candidates (K, D)."""
+        physics = self.nuisance(parameters[:, self.motion.num_parameters :])
+        if self.data.background is not None:
+            physics["background"] = self.data.background
+        return self.scene.intensity(self.path_lengths(parameters), pooling=self.stage.oversampling, **physics)
 
     def control_points(self, parameters: Tensor) -> Tensor:
         """Control-point displacements (K, nx, ny, nz, 3) of candidates."""
         rotations, translations = self.motion(parameters[:, : self.motion.num_parameters])
         return control_points_from_groups(self.scene.deformation.grid, self.labels, rotations, translations)
 
+    def deformation_gradients(self, parameters: Tensor) -> Tensor:
+        """Deformation gradients (K, n, 3, 3) at some of the implant's nodes, in the grid's axes."""
+        rotations, translations = self.motion(parameters[:, : self.motion.num_parameters])
+        steps = torch.cat([translations[..., None, :], (rotations - torch.eye(3).to(rotations)).mT], dim=-2)
+        return torch.eye(3).to(steps) + (self.slopes @ steps.flatten(1, 2)[:, None]).mT
+
     def penalty(self, parameters: Tensor) -> Tensor:
-        """beta R (eq. 5) of candidates, shape (K,)."""
-        phi = self.control_points(parameters)
-        return self.config.beta * diffusion_penalty(phi, self.scene.deformation.grid)
+        """beta R (eq. 5) and the implant's elastic energy, weighted, of candidates, shape (K,)."""
+        diffusion = diffusion_penalty(self.control_points(parameters), self.scene.deformation.grid)
+        elastic = strain_energy(self.deformation_gradients(parameters), self.solid.masses)
+        return self.config.beta * diffusion + self.config.stiffness * elastic
 
     # -- what optimisers ask for -----------------------------------------------------------------------------------
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 from torchkcreg.geometry import transform_points
 
+from .background import estimate_background
 from .callbacks import Callback
-from .config import RegistrationConfig
+from .config import RegistrationConfig, Stage
 from .data import RegistrationData
 from .objective import StageObjective
 from .optimizers import Progress, minimize
@@ -56,7 +58,7 @@ class Trainer:
         stage, start = self.stages[index], time.perf_counter()
         for callback in self.callbacks:
             callback.on_stage_start(self, index, stage)
-        objective = StageObjective(self.scene, self.data, stage, self.config)
+        objective = self._objective(stage)
 
         def report(progress: Progress) -> None:
             record = {"stage": index, "iteration": progress.iteration, "loss": progress.loss}
@@ -71,9 +73,15 @@ class Trainer:
             callback.on_stage_end(self, index, stage)
         return objective
 
+    def _objective(self, stage: Stage) -> StageObjective:
+        data = self.data
+        if stage.background and hasattr(self.scene.intensity, "scatter"):
+            data = replace(data, background=estimate_background(self.scene, data, self.config))
+        return StageObjective(self.scene, data, stage, self.config)
+
     def _result(self, objective: StageObjective | None) -> RegistrationResult:
         scene = self.scene
-        final = StageObjective(scene, self.data, self.stages[-1], self.config)
+        final = self._objective(self.stages[-1])
         with torch.no_grad():
             gc = final.gradient_correlations(torch.zeros(1, final.num_parameters, dtype=torch.float64))[0]
         intensity = {name: float(value) for name, value in scene.intensity.named_parameters()}

@@ -1,1 +1,43 @@
-""""""
+"""Simulation of weight-bearing experiments: hardware, loads, the scanner, and whole cases with known truth.
+
+`weight_bearing_case` gives images of a loaded plate together with what really happened to it.
+"""
+
+from torchkcreg.simulation.cases import SimulatedCase, weight_bearing_case
+from torchkcreg.simulation.chords import chord_image, chord_lengths
+from torchkcreg.simulation.hardware import (
+    bead_meshes,
+    bone_fragments,
+    flared_plate,
+    hole_positions,
+    locking_plate,
+    locking_screws,
+    screw_mesh,
+)
+from torchkcreg.simulation.loads import Load, RodMotion
+from torchkcreg.simulation.parts import Part, material_paths
+from torchkcreg.simulation.scanner import DetectorModel, simulate_projections
+from torchkcreg.simulation.solids import Cylinder, Sphere, Tube
+
+__all__ = [
+    "Cylinder",
+    "DetectorModel",
+    "Load",
+    "Part",
+    "RodMotion",
+    "SimulatedCase",
+    "Sphere",
+    "Tube",
+    "bead_meshes",
+    "bone_fragments",
+    "chord_image",
+    "chord_lengths",
+    "flared_plate",
+    "hole_positions",
+    "locking_plate",
+    "locking_screws",
+    "material_paths",
+    "screw_mesh",
+    "simulate_projections",
+    "weight_bearing_case",
+]

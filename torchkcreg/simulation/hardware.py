@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import TypedDict
 
 import numpy as np
 import torch
@@ -11,6 +12,9 @@ import trimesh
 
 from torchkcreg.simulation.loads import RodMotion
 from torchkcreg.simulation.outline import plate_outline
+
+Screw = TypedDict("Screw", {"from": list[float], "to": list[float], "radius": float, "material": str, "fragment": str})
+"""A screw as `screws.json` lists them: a cylinder from head to tip, mm, and the fragment that holds it."""
 
 
 def locking_plate(
@@ -25,8 +29,8 @@ def locking_plate(
 ) -> trimesh.Trimesh:
     """Watertight mesh of a straight plate with through holes in one row and rounded ends, centred on the origin.
 
-    Long axis z, width x, thickness y; the bone is on the side of negative y. No edge is much longer than `max_edge`, so
-    that the mesh bends smoothly.
+    Long axis z, width x, thickness y; the bone is on the side of negative y. The surface is a grid
+    of lines `max_edge` apart, so that the mesh bends smoothly.
 
     Args:
         length: Length along z, mm.
@@ -35,7 +39,7 @@ def locking_plate(
         num_holes: Holes, evenly spaced; see `hole_positions`.
         hole_radius: Radius of a hole, mm.
         end_margin: Length of each rounded end, mm; the rest is divided evenly among the holes.
-        max_edge: Target length of the longest edges, mm.
+        max_edge: Spacing of the surface's grid lines, mm; triangles' long sides are up to 1.6 times as long.
 
     Raises:
         ValueError: If a hole does not fit into its part of the plate, or a size is not positive.
@@ -82,7 +86,7 @@ def flared_plate(
         flare: Width of the head over that of the shaft.
         bow_deg: Angle between the two ends about x, degrees.
         twist_deg: Angle between the two ends about the axis, degrees.
-        max_edge: Target length of the longest edges, mm.
+        max_edge: Spacing of the surface's grid lines, mm; triangles' long sides are up to 1.6 times as long.
 
     Raises:
         ValueError: As `locking_plate`.
@@ -105,11 +109,10 @@ def locking_screws(
     tip_y: float = -34.0,
     radius: float = 2.0,
     material: str = "steel",
-) -> list[dict[str, object]]:
-    """Screws through a plate at heights z as cylinders from head to tip, each a dict as `screws.json` lists them.
+) -> list[Screw]:
+    """Screws through a plate at heights z in mm, in its frame, each a dict as `screws.json` lists them.
 
-    Keys: `from` and `to`, [x, y, z] in mm in the plate's frame, `radius`, `material`, and the bone's `fragment` that
-    holds it, `distal` below z = 0 and `proximal` above.
+    The bone's fragment that holds a screw is the `distal` one below z = 0 and the `proximal` one above.
 
     >>> locking_screws([-63.0])[0]["fragment"]
     'distal'
@@ -126,7 +129,7 @@ def locking_screws(
     ]
 
 
-def screw_mesh(screw: dict[str, object], *, sections: int = 32) -> trimesh.Trimesh:
+def screw_mesh(screw: Screw, *, sections: int = 32) -> trimesh.Trimesh:
     """Watertight mesh of a screw, a cylinder from its head to its tip."""
     segment = np.array([screw["from"], screw["to"]], dtype=float)
     return trimesh.creation.cylinder(radius=screw["radius"], segment=segment, sections=sections)

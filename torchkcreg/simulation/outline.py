@@ -26,13 +26,11 @@ def plate_outline(
     if not 0 < hole_radius < 0.95 * min(pitch, width) / 2:
         raise ValueError(f"hole_radius must be positive and fit into {pitch:g} x {width:g} mm, got {hole_radius}")
     across, along = math.ceil(width / max_edge), math.ceil(pitch / max_edge)
-    patches = []
-    for hole in range(num_holes):
-        center = (hole - (num_holes - 1) / 2) * pitch
-        patches.append(_hole_patch(center, width, pitch, hole_radius, across, along, max_edge))
-    for side in (-1, 1):
-        patches.append(_end_patch(side, length / 2 - end_margin, width, end_margin, across, max_edge))
-    return _merged(patches)
+    centers = [(hole - (num_holes - 1) / 2) * pitch for hole in range(num_holes)]
+    holes = [_hole_patch(center, width, pitch, hole_radius, across, along, max_edge) for center in centers]
+    start = length / 2 - end_margin
+    ends = [_end_patch(side, start, width, end_margin, across, max_edge) for side in (-1, 1)]
+    return _merged(holes + ends)
 
 
 def _hole_patch(

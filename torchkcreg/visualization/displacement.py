@@ -120,9 +120,11 @@ def _limits(nodes: _Upright, frame: NDArray) -> tuple[float, float]:
 def _draw(axes: Axes, nodes: _Upright, frame: NDArray, norm: Normalize) -> PathCollection:
     before, after = nodes.before @ frame, nodes.after @ frame
     order = np.argsort(after[:, 2])  # near nodes over far ones
-    shared = {"s": nodes.dot_area, "linewidths": 0, "rasterized": True}
-    axes.scatter(before[:, 0], before[:, 1], color="0.82", **shared)
-    dots = axes.scatter(after[order, 0], after[order, 1], c=nodes.lengths[order], cmap=COLOUR_MAP, norm=norm, **shared)
+    size = nodes.dot_area
+    axes.scatter(before[:, 0], before[:, 1], s=size, color="0.82", linewidths=0, rasterized=True)
+    right, up, _ = after[order].T
+    colours = nodes.lengths[order]
+    dots = axes.scatter(right, up, s=size, c=colours, cmap=COLOUR_MAP, norm=norm, linewidths=0, rasterized=True)
     axes.set_aspect("equal")
     axes.set_xlabel("mm")
     axes.margins(y=0.02)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -48,34 +49,34 @@ def overlay_figure(
     Raises:
         ValueError: shapes differ.
     """
-    for name, images in (("measured", measured), ("before", before), ("after", after)):
-        if images is not None and (images.ndim != 3 or images.shape != after.shape):
+    given = {"measured": measured, "before": before, "after": after}
+    for name, tensor in given.items():
+        if tensor is not None and (tensor.ndim != 3 or tensor.shape != after.shape):
             raise ValueError(
-                f"{name} must have shape (V, rows, cols) = {tuple(after.shape)}, got {tuple(images.shape)}"
+                f"{name} must have shape (V, rows, cols) = {tuple(after.shape)}, got {tuple(tensor.shape)}"
             )
-    rows = [(name, drr, gc) for name, drr, gc in (("before", before, gc_before), ("after", after, gc_after))]
-    rows = [row for row in rows if row[1] is not None]
-    images = measured.detach().cpu().double().numpy()
-    drrs = [drr.detach().cpu().double().numpy() for _, drr, _ in rows if drr is not None]
-    windows = _windows(drrs, margin_px) if crop else [(slice(None), slice(None))] * len(images)
+    arrays = {name: tensor.detach().cpu().double().numpy() for name, tensor in given.items() if tensor is not None}
+    images = arrays.pop("measured")
+    gc = {"before": gc_before, "after": gc_after}
+    windows = _windows(list(arrays.values()), margin_px) if crop else [(slice(None), slice(None))] * len(images)
     dv, du = pixel_spacing or (1.0, 1.0)
 
     height, width = images[0][windows[0]].shape
     panel_in = float(np.clip(_PANEL_HEIGHT_IN * width * du / (height * dv), _NARROWEST_IN, _WIDEST_IN))
     panel_height_in = min(_PANEL_HEIGHT_IN, panel_in * height * dv / (width * du))
     figure = Figure(
-        figsize=(len(images) * (panel_in + 0.12) + 0.4, len(rows) * (panel_height_in + 0.1) + 0.4),
-        layout="constrained",
+        figsize=(len(images) * (panel_in + 0.12) + 0.4, len(arrays) * (panel_height_in + 0.1) + 0.4),
+        layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, wspace=0.01, hspace=0.01),
         facecolor="white",
     )
-    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0.01, hspace=0.01)  # type: ignore[union-attr]
-    axes = figure.subplots(len(rows), len(images), squeeze=False)
-    for i, ((name, _, gc), drr) in enumerate(zip(rows, drrs)):
+    axes = figure.subplots(len(arrays), len(images), squeeze=False)
+    for i, (name, drr) in enumerate(arrays.items()):
         axes[i, 0].set_ylabel(name, fontsize=11)
+        similarity = gc[name]
         for view, window in enumerate(windows):
             _draw(axes[i, view], images[view][window], drr[view][window], dv / du)
-            if gc is not None:
-                _write(axes[i, view], f"GC {float(gc[view]):.3f}")
+            if similarity is not None:
+                _write(axes[i, view], f"GC {float(similarity[view]):.3f}")
     for view in range(len(images)):
         axes[0, view].set_title(f"view {view}" if view_labels is None else view_labels[view], fontsize=10)
     if pixel_spacing is not None:
@@ -89,16 +90,16 @@ def _windows(drrs: list[NDArray], margin_px: int) -> list[tuple[slice, slice]]:
     _, num_rows, num_cols = shadow.shape
     boxes = []
     for view in shadow:
-        v, u = np.nonzero(view.any(1))[0], np.nonzero(view.any(0))[0]
-        boxes.append((v[0], v[-1] + 1, u[0], u[-1] + 1) if len(v) else (0, num_rows, 0, num_cols))
+        v, u = np.nonzero(view.any(1))[0].tolist(), np.nonzero(view.any(0))[0].tolist()
+        boxes.append((v[0], v[-1] + 1, u[0], u[-1] + 1) if v else (0, num_rows, 0, num_cols))
     height = min(num_rows, max(box[1] - box[0] for box in boxes) + 2 * margin_px)
     width = max(box[3] - box[2] for box in boxes) + 2 * margin_px
     width = min(num_cols, max(width, height // 4))  # room for the text beside a slim plate seen edge on
     windows = []
     for top, bottom, left, right in boxes:
-        v = int(np.clip((top + bottom - height) // 2, 0, num_rows - height))
-        u = int(np.clip((left + right - width) // 2, 0, num_cols - width))
-        windows.append((slice(v, v + height), slice(u, u + width)))
+        first_row = int(np.clip((top + bottom - height) // 2, 0, num_rows - height))
+        first_col = int(np.clip((left + right - width) // 2, 0, num_cols - width))
+        windows.append((slice(first_row, first_row + height), slice(first_col, first_col + width)))
     return windows
 
 

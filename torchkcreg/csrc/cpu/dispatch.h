@@ -5,8 +5,7 @@
 
 #if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
 #if __GNUC__ >= 12
-#define TORCHKCREG_MULTIVERSION \
-  __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default"), flatten))
+#define TORCHKCREG_MULTIVERSION __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default"), flatten))
 #else  // the names of whole levels are newer than these compilers
 #define TORCHKCREG_MULTIVERSION __attribute__((target_clones("avx512f", "avx2", "default"), flatten))
 #endif

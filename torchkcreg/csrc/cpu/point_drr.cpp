@@ -1,8 +1,8 @@
-// CPU kernels of the point-cloud DRR: how the work is split. The loops over nodes are in point_drr_kernel.h.
+// CPU kernels of the point-cloud DRR: how the work is split. What a task does is in point_drr_tiles.h.
 //
-// Sums in a fixed order whatever the number of threads: forward, every chunk of nodes draws a tile of its own, and tiles
-// are added to an image in the order of chunks, each row by one thread. Backward, a chunk's gradients belong to one task,
-// which takes views and (where masses share a gradient) candidates in order.
+// Sums in a fixed order whatever the number of threads: forward, every chunk of nodes draws a tile of its own, and
+// tiles are added to an image in the order of chunks, each row by one thread. Backward, a chunk's gradients belong to
+// one task, which takes views and (where masses share a gradient) candidates in order.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
@@ -14,7 +14,7 @@
 #include <tuple>
 #include <vector>
 
-#include "point_drr_kernel.h"
+#include "point_drr_tiles.h"
 
 namespace torchkcreg {
 namespace {
@@ -24,115 +24,6 @@ using torch::stable::Tensor;
 
 constexpr int64_t kTilesAtOnce = 512;  // bounds the memory for tiles; does not change any sum
 constexpr int64_t kBandRows = 32;
-
-struct Problem {
-  int64_t candidates, nodes, views, rows, cols, block_size, num_blocks;
-  TableShape table;
-
-  int64_t chunks_per_block() const { return (std::min(block_size, nodes) + kChunk - 1) / kChunk; }
-  int64_t num_chunks() const { return num_blocks * chunks_per_block(); }
-  int64_t chunk_begin(int64_t chunk) const { return block(chunk) * block_size + chunk % chunks_per_block() * kChunk; }
-  int64_t chunk_size(int64_t chunk) const {
-    const int64_t end = std::min({nodes, (block(chunk) + 1) * block_size, chunk_begin(chunk) + kChunk});
-    return std::max<int64_t>(end - chunk_begin(chunk), 0);
-  }
-  int64_t block(int64_t chunk) const { return chunk / chunks_per_block(); }
-  int64_t table_offset(int64_t view, int64_t chunk) const {
-    const int64_t side = table.phases + 1;
-    return (view * num_blocks + block(chunk)) * side * side * table.taps * table.taps;
-  }
-};
-
-template <typename scalar_t>
-struct Inputs {
-  const scalar_t *points, *masses, *matrices, *table;
-};
-
-template <typename scalar_t>
-struct Tile {
-  Patch patch;
-  std::vector<scalar_t> pixels;
-};
-
-template <typename scalar_t>
-TORCHKCREG_INLINE void locate_nodes(const Problem& p, const Inputs<scalar_t>& in, int64_t candidate, int64_t view,
-                                    int64_t chunk, ChunkView<scalar_t>& scratch) {
-  const int64_t count = p.chunk_size(chunk);
-  const scalar_t* points = in.points + (candidate * p.nodes + p.chunk_begin(chunk)) * 3;
-  const int64_t seen =
-      project_nodes(points, count, in.matrices + 12 * view, p.table.taps, p.rows, p.cols, scratch);
-  compact_nodes(count, seen, scratch);
-  locate_taps(p.table, scratch);
-}
-
-template <typename scalar_t, int T>
-TORCHKCREG_INLINE void draw_tile(const Problem& p, const Inputs<scalar_t>& in, int64_t candidate, int64_t view,
-                                 int64_t chunk, ChunkView<scalar_t>& scratch, Tile<scalar_t>& tile) {
-  locate_nodes(p, in, candidate, view, chunk, scratch);
-  tile.patch = scratch.patch;
-  tile.pixels.assign(scratch.patch.size(), scalar_t(0));
-  spread_nodes<scalar_t, T>(scratch, p.table, in.table + p.table_offset(view, chunk), in.masses + p.chunk_begin(chunk),
-                            tile.pixels.data());
-}
-
-// Copies a patch of an image into a tile, zero beyond the detector.
-template <typename scalar_t>
-void copy_patch(const Problem& p, const scalar_t* image, Tile<scalar_t>& tile) {
-  const Patch& patch = tile.patch;
-  tile.pixels.assign(patch.size(), scalar_t(0));
-  const int64_t first = std::max<int64_t>(patch.col_begin, 0), last = std::min<int64_t>(patch.col_end, p.cols);
-  for (int64_t r = std::max<int64_t>(patch.row_begin, 0); r < std::min<int64_t>(patch.row_end, p.rows); ++r) {
-    std::copy(image + r * p.cols + first, image + r * p.cols + last,
-              tile.pixels.data() + (r - patch.row_begin) * patch.cols() + first - patch.col_begin);
-  }
-}
-
-template <typename scalar_t, int T>
-TORCHKCREG_INLINE void gather_tile(const Problem& p, const Inputs<scalar_t>& in, const scalar_t* grad, int64_t candidate,
-                                   int64_t view, int64_t chunk, ChunkView<scalar_t>& scratch, Tile<scalar_t>& tile,
-                                   const ChunkGradients<scalar_t>& out) {
-  locate_nodes(p, in, candidate, view, chunk, scratch);
-  tile.patch = scratch.patch;
-  copy_patch(p, grad + (candidate * p.views + view) * p.rows * p.cols, tile);
-  gather_nodes<scalar_t, T>(scratch, p.table, in.table + p.table_offset(view, chunk),
-                            in.points + (candidate * p.nodes + p.chunk_begin(chunk)) * 3,
-                            in.masses + p.chunk_begin(chunk), in.matrices + 12 * view, tile.pixels.data(), out);
-}
-
-// target_clones works on plain functions only, hence one pair of them for every case worth its own code.
-#define TORCHKCREG_TILE_FUNCTIONS(name, scalar_t, T)                                                                    \
-  TORCHKCREG_MULTIVERSION void draw_##name(const Problem& p, const Inputs<scalar_t>& in, int64_t candidate, int64_t view, \
-                                           int64_t chunk, ChunkView<scalar_t>& scratch, Tile<scalar_t>& tile) {         \
-    draw_tile<scalar_t, T>(p, in, candidate, view, chunk, scratch, tile);                                               \
-  }                                                                                                                     \
-  TORCHKCREG_MULTIVERSION void gather_##name(const Problem& p, const Inputs<scalar_t>& in, const scalar_t* grad,        \
-                                             int64_t candidate, int64_t view, int64_t chunk,                            \
-                                             ChunkView<scalar_t>& scratch, Tile<scalar_t>& tile,                        \
-                                             const ChunkGradients<scalar_t>& out) {                                     \
-    gather_tile<scalar_t, T>(p, in, grad, candidate, view, chunk, scratch, tile, out);                                  \
-  }
-TORCHKCREG_TILE_FUNCTIONS(float_4, float, 4)
-TORCHKCREG_TILE_FUNCTIONS(float_any, float, 0)
-TORCHKCREG_TILE_FUNCTIONS(double_4, double, 4)
-TORCHKCREG_TILE_FUNCTIONS(double_any, double, 0)
-#undef TORCHKCREG_TILE_FUNCTIONS
-
-void draw(const Problem& p, const Inputs<float>& in, int64_t b, int64_t v, int64_t c, ChunkView<float>& scratch,
-          Tile<float>& tile) {
-  (p.table.taps == 4 ? draw_float_4 : draw_float_any)(p, in, b, v, c, scratch, tile);
-}
-void draw(const Problem& p, const Inputs<double>& in, int64_t b, int64_t v, int64_t c, ChunkView<double>& scratch,
-          Tile<double>& tile) {
-  (p.table.taps == 4 ? draw_double_4 : draw_double_any)(p, in, b, v, c, scratch, tile);
-}
-void gather(const Problem& p, const Inputs<float>& in, const float* grad, int64_t b, int64_t v, int64_t c,
-            ChunkView<float>& scratch, Tile<float>& tile, const ChunkGradients<float>& out) {
-  (p.table.taps == 4 ? gather_float_4 : gather_float_any)(p, in, grad, b, v, c, scratch, tile, out);
-}
-void gather(const Problem& p, const Inputs<double>& in, const double* grad, int64_t b, int64_t v, int64_t c,
-            ChunkView<double>& scratch, Tile<double>& tile, const ChunkGradients<double>& out) {
-  (p.table.taps == 4 ? gather_double_4 : gather_double_any)(p, in, grad, b, v, c, scratch, tile, out);
-}
 
 // Adds a tile's rows in [row_begin, row_end) to an image.
 template <typename scalar_t>
@@ -180,7 +71,8 @@ struct Gradients {
 };
 
 template <typename scalar_t>
-void gather_gradients(const Problem& p, const Inputs<scalar_t>& in, const scalar_t* grad, const Gradients<scalar_t>& out) {
+void gather_gradients(const Problem& p, const Inputs<scalar_t>& in, const scalar_t* grad,
+                      const Gradients<scalar_t>& out) {
   const int64_t chunks = p.num_chunks();
   std::vector<double> shares(out.matrices ? p.candidates * chunks * p.views * 12 : 0);
   const auto gather_chunk = [&](int64_t b, int64_t c, ChunkView<scalar_t>& scratch, Tile<scalar_t>& tile) {
@@ -216,6 +108,7 @@ Problem check(const Tensor& points, const Tensor& masses, const Tensor& matrices
                   "table must have shape (V, num_blocks, R + 1, R + 1, T, T)");
   STD_TORCH_CHECK(table.size(2) >= 2 && table.size(4) >= 2 && table.size(4) % 2 == 0,
                   "table must have at least one phase and an even number of taps");
+  STD_TORCH_CHECK(table.size(4) <= kMaxTaps, "table must have at most 64 taps");
   STD_TORCH_CHECK(block_size > 0, "block_size must be positive");
   STD_TORCH_CHECK(rows > 0 && cols > 0 && rows < (1 << 24) && cols < (1 << 24), "rows and cols must be positive");
   const int64_t num_blocks = (points.size(1) + block_size - 1) / block_size;
@@ -226,8 +119,8 @@ Problem check(const Tensor& points, const Tensor& masses, const Tensor& matrices
   for (const Tensor* t : {&points, &masses, &matrices, &table}) {
     STD_TORCH_CHECK(t->is_cpu() && t->scalar_type() == dtype, "tensors must be on the CPU and of one dtype");
   }
-  return Problem{points.size(0), points.size(1), matrices.size(0), rows, cols, block_size, num_blocks,
-                 TableShape{table.size(2) - 1, table.size(4)}};
+  return Problem{points.size(0), points.size(1), matrices.size(0), rows,
+                 cols,           block_size,     num_blocks,       TableShape{table.size(2) - 1, table.size(4)}};
 }
 
 template <typename scalar_t>
@@ -269,8 +162,8 @@ std::tuple<Tensor, Tensor, Tensor> point_drr_backward(const Tensor& grad_, const
   const Tensor grad = torch::stable::contiguous(grad_);
   Tensor to_points = torch::stable::new_zeros(points, {p.candidates, p.nodes, 3});
   Tensor to_masses = torch::stable::new_zeros(points, {need_masses ? p.nodes : 0});
-  Tensor to_matrices = need_matrices ? torch::stable::new_zeros(points, {p.views, 3, 4})
-                                     : torch::stable::new_zeros(points, {0});
+  Tensor to_matrices =
+      need_matrices ? torch::stable::new_zeros(points, {p.views, 3, 4}) : torch::stable::new_zeros(points, {0});
   if (points.scalar_type() == ScalarType::Float) {
     gather_gradients(p, pointers<float>(points, masses, matrices, table), grad.const_data_ptr<float>(),
                      gradient_pointers<float>(to_points, to_masses, to_matrices));

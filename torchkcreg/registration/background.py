@@ -1,0 +1,42 @@
+"""What the model does not know, as a smooth attenuation: bone, water, soft tissue."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from torchkcreg.physics import gaussian_blur
+
+from .config import RegistrationConfig, Stage
+from .data import RegistrationData
+from .objective import StageObjective
+from .scene import Scene
+
+
+@torch.no_grad()
+def estimate_background(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> Tensor:
+    """Share b of the beam that everything but the known components lets through, shape (V, rows, cols).
+
+    The measured transmission is ``b T + s`` with T of the known components and the scatter floor s. Within a Gaussian
+    window of ``config.background_mm`` b is taken as constant and fitted by least squares:
+    ``b = G (T (I - s)) / G (T T)``. Pixels behind thick metal hardly count, so that b goes on under the implant from
+    its surroundings. It is too smooth to take over edges that the implant should explain, but behind bone or water it
+    sets how much of the signal is scatter, which decides how saturated an edge looks.
+    """
+    stage = Stage(bin=2, pitch_factor=2, margin_mm=None)
+    objective = StageObjective(scene, replace(data, background=None), stage, config)
+    nothing = torch.zeros(1, objective.num_parameters, dtype=torch.float64)
+    physics = objective.nuisance(nothing[:, objective.motion.num_parameters :])
+    paths = objective.path_lengths(nothing)
+    scatter = float(scene.intensity.scatter)
+    known = torch.exp(-scene.intensity(paths, pooling=stage.oversampling, **{**physics, "scatter": torch.zeros(1)}))[0]
+    excess = torch.exp(-objective.data.line_integrals) - scatter
+    weights = known * objective.data.mask
+    sigma = config.background_mm / (data.geometry.pixel_spacing[1] * stage.bin)
+    smooth = gaussian_blur(weights * excess, sigma) / gaussian_blur(weights * known, sigma).clamp_min(1e-6)
+    share = smooth.clamp(0.01, 2.0)
+    size = data.geometry.det_shape
+    return interpolate(share[None], size=tuple(size), mode="bilinear", align_corners=False)[0]
