@@ -4,33 +4,53 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import torchkcreg
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit status: 0, or 2 after a one-line error that names what was wrong."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
     try:
-        options.run(options)
+        options = _parser().parse_args(arguments)
+    except SystemExit as done:  # argparse is done after --help, --version, or a wrong flag
+        return int(done.code or 0)
+    name = f"torchkcreg {options.command}"
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        print(f"{name}: warning: {_one_line(message)}", file=sys.stderr)
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = show
+            options.run(options)
     except (ValueError, OSError) as error:
-        print(f"torchkcreg {options.command}: error: {_one_line(error)}", file=sys.stderr)
+        print(f"{name}: error: {_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"torchkcreg {options.command}: interrupted", file=sys.stderr)
+        print(f"{name}: interrupted", file=sys.stderr)
         return 130
     return 0
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def _one_line(message: Exception | str) -> str:
+    return " ".join(str(message).split())
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, like all the others."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {_one_line(message)}\n")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="torchkcreg", description=torchkcreg.__doc__)
+    parser = _Parser(prog="torchkcreg", description=torchkcreg.__doc__)
     parser.add_argument("--version", action="version", version=f"torchkcreg {torchkcreg.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_register(commands)
@@ -51,7 +71,7 @@ def _add_register(commands) -> None:
     command = _command(commands, "register", _register, "measure the deformation of an implant in a few projections")
     command.add_argument("--implant", type=Path, required=True, help="closed mesh of the undeformed implant (mm)")
     command.add_argument("--geometry", type=Path, required=True, help="projection matrices (JSON)")
-    command.add_argument("--projections", type=Path, required=True, help="intensities or line integrals (NPZ, NPY, MHA)")
+    command.add_argument("--projections", type=Path, required=True, help="intensities or line integrals (NPZ, MHA)")
     command.add_argument("--out", type=Path, required=True, help="run folder to make")
     command.add_argument("--views", type=_integers, help="views to use, such as 15,16,17 (default: all)")
     command.add_argument("--material", help="material of the implant, such as steel: polyenergetic DRRs")
@@ -94,7 +114,7 @@ def _register(options: argparse.Namespace) -> None:
     )
     names = ("material", "preset", "pitch_mm", "seed", "backend", "device")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    register_files(
+    result = register_files(
         files,
         options.out,
         overrides=overrides,
@@ -102,21 +122,29 @@ def _register(options: argparse.Namespace) -> None:
         resume=options.resume,
         figures=not options.no_figures,
     )
+    similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())
+    print(f"gradient correlation of each view {similarity}; run folder {options.out}")
 
 
 def _add_warp(commands) -> None:
     command = _command(commands, "warp", _warp, "move points of the undeformed implant's frame to the world")
     command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
     command.add_argument("--points", type=Path, required=True, help="x,y,z in the implant's frame, mm (CSV)")
-    command.add_argument("--out", type=Path, required=True, help="CSV to write: x,y,z in the world, and whether outside")
+    command.add_argument("--out", type=Path, required=True, help="CSV to write: x,y,z in the world, outside or not")
 
 
 def _warp(options: argparse.Namespace) -> None:
     from torchkcreg.io import read_points, read_run, write_points
 
-    result = read_run(options.run_folder)
-    points = read_points(options.points)
-    write_points(options.out, result.warp(points), outside=result.outside(points))
+    result, points = read_run(options.run_folder), read_points(options.points)
+    outside = result.outside(points)
+    if outside.any():
+        warnings.warn(
+            f"{int(outside.sum())} of {len(points)} points lie beyond the control points: "
+            "they move rigidly with the nearest group",
+            stacklevel=1,
+        )
+    write_points(options.out, result.warp(points), outside=outside)
 
 
 def _add_evaluate(commands) -> None:
@@ -128,11 +156,10 @@ def _add_evaluate(commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    from torchkcreg.evaluation import evaluate_points
+    from torchkcreg.evaluation import evaluate
     from torchkcreg.io import read_points, read_run, write_json
 
-    result = read_run(options.run_folder)
-    metrics = evaluate_points(result.warp(read_points(options.points)), read_points(options.truth))
+    metrics = evaluate(read_run(options.run_folder), read_points(options.points), read_points(options.truth))
     print(metrics)
     if options.out:
         write_json(options.out, metrics.to_dict())

@@ -18,7 +18,17 @@ def strain_energy(gradients: Tensor, volumes: Tensor, *, poisson: float = 0.0) -
         volumes: Volumes of the nodes, shape (N,), mm^3.
         poisson: Poisson's ratio. Zero suits control points that move in rigid groups: those cannot contract sideways,
             and would make an implant that wants to look stiffer than it is.
+
+    Raises:
+        ValueError: If poisson is not from 0 up to, but not including, 0.5.
+
+    Example:
+        >>> stretch = torch.diag(torch.tensor([1.01, 1.0, 1.0]))
+        >>> round(float(strain_energy(stretch[None], torch.ones(1))) * 1e6, 2)
+        50.5
     """
+    if not 0 <= poisson < 0.5:
+        raise ValueError(f"poisson must be from 0 up to, but not including, 0.5, got {poisson}")
     strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(gradients))
     first = poisson / ((1 + poisson) * (1 - 2 * poisson))
     trace = strain.diagonal(dim1=-2, dim2=-1).sum(-1)

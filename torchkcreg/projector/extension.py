@@ -17,7 +17,7 @@ DEFINES = ("-DTORCH_TARGET_VERSION=0x020a000000000000",)
 COMPILE_FLAGS = (
     ("/O2", "/std:c++17")
     if os.name == "nt"
-    else ("-O3", "-std=c++17", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-Wno-psabi")
+    else ("-O3", "-g0", "-std=c++17", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-Wno-psabi")
 )
 
 

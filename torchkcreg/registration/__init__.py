@@ -1,8 +1,10 @@
 """Registration: the objective, its optimisers and the coarse-to-fine loop."""
 
+from .background import estimate_background
 from .callbacks import Callback, ProgressBar
 from .config import RegistrationConfig, Stage, preset_stages
 from .data import RegistrationData
+from .model import StageModel
 from .objective import StageObjective
 from .register import build_scene, register
 from .result import RegistrationResult
@@ -17,9 +19,11 @@ __all__ = [
     "RegistrationResult",
     "Scene",
     "Stage",
+    "StageModel",
     "StageObjective",
     "Trainer",
     "build_scene",
+    "estimate_background",
     "preset_stages",
     "register",
 ]

@@ -12,7 +12,7 @@ from torchkcreg.physics import gaussian_blur
 
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
-from .objective import StageObjective
+from .model import StageModel
 from .scene import Scene
 
 
@@ -27,15 +27,15 @@ def estimate_background(scene: Scene, data: RegistrationData, config: Registrati
     sets how much of the signal is scatter, which decides how saturated an edge looks.
     """
     stage = Stage(bin=2, pitch_factor=2, margin_mm=None)
-    objective = StageObjective(scene, replace(data, background=None), stage, config)
-    nothing = torch.zeros(1, objective.num_parameters, dtype=torch.float64)
-    physics = objective.nuisance(nothing[:, objective.motion.num_parameters :])
-    paths = objective.path_lengths(nothing)
-    scatter = float(scene.intensity.scatter)
-    known = torch.exp(-scene.intensity(paths, pooling=stage.oversampling, **{**physics, "scatter": torch.zeros(1)}))[0]
-    excess = torch.exp(-objective.data.line_integrals) - scatter
-    weights = known * objective.data.mask
-    sigma = config.background_mm / (data.geometry.pixel_spacing[1] * stage.bin)
+    model = StageModel(scene, replace(data, background=None), stage, config)
+    still = torch.zeros(1, model.num_parameters, dtype=torch.float64)
+    physics = {**model.nuisance(model.split(still)[1]), "scatter": torch.zeros(1)}
+    paths = model.path_lengths(still)
+    scatter = float(scene.intensity.get_parameter("scatter").detach())
+    known = torch.exp(-scene.intensity(paths, pooling=stage.oversampling, **physics))[0]
+    excess = torch.exp(-model.data.line_integrals) - scatter
+    weights = known * model.data.mask
+    sigma = config.background_mm / model.data.geometry.pixel_spacing[1]
     smooth = gaussian_blur(weights * excess, sigma) / gaussian_blur(weights * known, sigma).clamp_min(1e-6)
     share = smooth.clamp(0.01, 2.0)
     size = data.geometry.det_shape

@@ -35,7 +35,8 @@ class ProgressBar(Callback):
 
     def on_stage_start(self, trainer: Trainer, index: int, stage: Stage) -> None:
         """Opens the stage's bar."""
-        name = f"stage {index + 1}/{len(trainer.stages)}: {stage.groups} group{'s' * (stage.groups > 1)}, {stage.optimizer}"
+        groups = "1 group" if stage.groups == 1 else f"{stage.groups} groups"
+        name = f"stage {index + 1}/{len(trainer.stages)}: {groups}, {stage.optimizer}"
         self._bar = tqdm(total=stage.iterations, desc=name, disable=self.disable, leave=True)
 
     def on_iteration(self, trainer: Trainer, index: int, progress: Progress) -> None:

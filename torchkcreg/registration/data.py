@@ -27,7 +27,7 @@ class RegistrationData:
 
     geometry: ConeBeamGeometry
     line_integrals: Tensor
-    mask: Tensor | None = None
+    mask: Tensor = None  # type: ignore[assignment]  # set below
     background: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -37,7 +37,9 @@ class RegistrationData:
         if shape[0] != self.geometry.num_views:
             raise ValueError(f"the geometry has {self.geometry.num_views} views, the projections have {shape[0]}")
         if shape[1:] != tuple(self.geometry.det_shape):
-            raise ValueError(f"the geometry's detector is {tuple(self.geometry.det_shape)} pixels, the projections' {shape[1:]}")
+            raise ValueError(
+                f"the geometry's detector is {tuple(self.geometry.det_shape)} pixels, the projections' {shape[1:]}"
+            )
         finite = torch.isfinite(self.line_integrals)
         mask = finite if self.mask is None else self.mask.to(torch.bool) & finite
         if tuple(mask.shape) != shape:
@@ -107,7 +109,7 @@ class RegistrationData:
             height, width = min(size_v, rows - v0), min(size_u, cols - u0)
             images[view, :height, :width] = self.line_integrals[view, v0 : v0 + height, u0 : u0 + width]
             mask[view, :height, :width] = self.mask[view, v0 : v0 + height, u0 : u0 + width]
-            if background is not None:
+            if background is not None and self.background is not None:
                 background[view, :height, :width] = self.background[view, v0 : v0 + height, u0 : u0 + width]
             matrices[view, 0] -= u0 * matrices[view, 2]
             matrices[view, 1] -= v0 * matrices[view, 2]

@@ -12,14 +12,14 @@ class GroupMotion:
     """Increments to the rigid motions of G groups, all in mm: three rotations times a radius, three translations.
 
     A zero vector leaves the control points where they are. Rotations turn about the group's own centre and are scaled
-    by its radius of gyration, so that a unit step in any parameter moves the implant by about 1 mm.
+    by its radius of gyration, so that a unit step in any parameter moves the implant by at most about 1 mm.
 
     Args:
         positions: Control points in the grid's frame, shape (C, 3), mm.
         displacements: Their displacements so far, shape (C, 3), mm.
         labels: Group of each control point, shape (C,).
         weights: Implant volume that each control point carries, shape (C,).
-        groups_centers: Centres about which the moments of the groups are taken, shape (G, 3), mm.
+        centers: Centres about which the moments of the groups are taken, shape (G, 3), mm.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class GroupMotion:
         return 6 * len(self.centers)
 
     def __call__(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (K, G, 3, 3) and translations (K, G, 3) of the groups about their centres (eq. of the design: R_g, t_g).
+        """Rotations (K, G, 3, 3) and translations (K, G, 3) of the groups about their centres, R_g and t_g.
 
         Args:
             parameters: Shape (K, 6 G), mm.

@@ -26,13 +26,14 @@ class Nuisance:
     """
 
     def __init__(self, intensity: nn.Module, names: Sequence[str], pixel_size: float) -> None:
-        self.intensity, self.pixel_size = intensity, pixel_size
-        self.names = [name for name in names if hasattr(intensity, _PARAMETERS[name][0])]
+        self.pixel_size = pixel_size
+        self.own = dict(intensity.named_parameters())
+        self.names = [name for name in names if _PARAMETERS[name][0] in self.own]
         table = [_PARAMETERS[name] for name in self.names]
         self.attributes = [row[0] for row in table]
         self.scale = torch.tensor([row[1] for row in table], dtype=torch.float64)
         low, high = (torch.tensor([row[i] for row in table], dtype=torch.float64) for i in (2, 3))
-        start = [float(getattr(intensity, a)) for a in self.attributes]
+        start = [float(self.own[a].detach()) for a in self.attributes]
         self.start = torch.tensor(start, dtype=torch.float64)
         self.low, self.high = (low - self.start) / self.scale, (high - self.start) / self.scale
 
@@ -52,8 +53,8 @@ class Nuisance:
     def __call__(self, steps: Tensor) -> dict[str, Tensor]:
         """Keyword arguments of the intensity model, each of shape (K,); the blur in the images' own pixels."""
         values = dict(zip(self.attributes, self.values(steps).unbind(-1), strict=True))
-        if hasattr(self.intensity, "blur_sigma_px"):
-            blur = values.get("blur_sigma_px", self.intensity.blur_sigma_px.detach().expand(len(steps)))
+        if "blur_sigma_px" in self.own:
+            blur = values.get("blur_sigma_px", self.own["blur_sigma_px"].detach().expand(len(steps)))
             values["blur_sigma_px"] = blur / self.pixel_size
         return {name: value.float() for name, value in values.items()}
 
@@ -61,4 +62,4 @@ class Nuisance:
     def accept(self, steps: Tensor) -> None:
         """Writes the stepped values into the model."""
         for attribute, value in zip(self.attributes, self.values(steps), strict=True):
-            getattr(self.intensity, attribute).fill_(float(value))
+            self.own[attribute].fill_(float(value))

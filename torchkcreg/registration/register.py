@@ -81,7 +81,5 @@ def register(
         callbacks: See :class:`torchkcreg.registration.Callback`.
     """
     config = config or RegistrationConfig()
-    scene = build_scene(
-        implant, config, spectrum=spectrum, components=components, implant_to_world=implant_to_world
-    )
+    scene = build_scene(implant, config, spectrum=spectrum, components=components, implant_to_world=implant_to_world)
     return Trainer(scene, data, config, callbacks=callbacks).fit()

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import FreeFormDeformation
+from torchkcreg.deformation import FreeFormDeformation, spline_displacement
 from torchkcreg.geometry import transform_points
 
 from .config import RegistrationConfig
@@ -47,7 +47,9 @@ class RegistrationResult:
         Points beyond the control-point grid move rigidly with the nearest group; :meth:`outside` flags them.
         """
         flat = points.detach().double().reshape(-1, 3)
-        moved = transform_points(self.implant_to_world.double(), self.deformation.double()(flat))
+        spline = self.deformation
+        u = spline_displacement(spline.grid, spline.control_points.double(), flat, labels=spline.labels)
+        moved = transform_points(self.implant_to_world.double(), flat + u)
         return moved.reshape(points.shape)
 
     def outside(self, points: Tensor) -> Tensor:

@@ -45,16 +45,15 @@ class Trainer:
     def check(self) -> None:
         """Raises ValueError if the implant lies outside every view at its start pose."""
         points = transform_points(self.scene.implant_to_world, self.scene.implant.points.double())
-        self.data.windowed(points, self.stages[0].margin_mm / self.data.geometry.pixel_spacing[1])
+        self.data.windowed(points, (self.stages[0].margin_mm or 0.0) / self.data.geometry.pixel_spacing[1])
 
     def fit(self) -> RegistrationResult:
         """Runs the stages that are left and returns the result."""
-        objective = None
         while self.next_stage < len(self.stages):
-            objective = self._run_stage(self.next_stage)
-        return self._result(objective)
+            self._run_stage(self.next_stage)
+        return self._result()
 
-    def _run_stage(self, index: int) -> StageObjective:
+    def _run_stage(self, index: int) -> None:
         stage, start = self.stages[index], time.perf_counter()
         for callback in self.callbacks:
             callback.on_stage_start(self, index, stage)
@@ -71,7 +70,6 @@ class Trainer:
         self.next_stage = index + 1
         for callback in self.callbacks:
             callback.on_stage_end(self, index, stage)
-        return objective
 
     def _objective(self, stage: Stage) -> StageObjective:
         data = self.data
@@ -79,7 +77,7 @@ class Trainer:
             data = replace(data, background=estimate_background(self.scene, data, self.config))
         return StageObjective(self.scene, data, stage, self.config)
 
-    def _result(self, objective: StageObjective | None) -> RegistrationResult:
+    def _result(self) -> RegistrationResult:
         scene = self.scene
         final = self._objective(self.stages[-1])
         with torch.no_grad():

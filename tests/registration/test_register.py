@@ -1,0 +1,166 @@
+"""Whole registrations of small scenes: accuracy, resuming, background, bad input."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from pydantic import ValidationError
+from small_scene import RIGID, SCREW, bend, geometry, image, plate, pose, scene
+
+from torchkcreg.geometry import transform_points
+from torchkcreg.registration import (
+    Callback,
+    RegistrationConfig,
+    RegistrationData,
+    RegistrationResult,
+    Stage,
+    Trainer,
+    estimate_background,
+    preset_stages,
+    register,
+)
+
+GRID = {"grid_shape": (4, 4, 6), "grid_spacing_mm": (10.0, 10.0, 12.0)}
+PLAIN = RegistrationConfig(stages=RIGID, **GRID)
+BENDING = RegistrationConfig(
+    stages=(Stage(oversampling=1), Stage(groups=3, oversampling=1, tolerance=1e-4)), stiffness=1.0, beta=1e-7, **GRID
+)
+
+
+def test_a_rigid_motion_of_5_mm_and_5_degrees_is_recovered_within_20_micrometres() -> None:
+    truth = pose(5, 5)
+    result = register(plate(), image(scene(PLAIN, truth), PLAIN), PLAIN)
+    points = plate().points.double()
+    error = (result.warp(points) - transform_points(truth, points)).norm(dim=-1)
+    assert float(error.square().mean().sqrt()) < 0.02
+    assert float(result.gc.min()) > 0.999
+
+
+def test_bending_is_recovered() -> None:
+    truth = scene(BENDING, pose(0.5, 0.5))
+    bend(truth, 0.03)
+    result = register(plate(), image(truth, BENDING), BENDING)
+    points = plate().points.double()
+    expected = transform_points(truth.implant_to_world, truth.deformation(points))
+    rest = scene(BENDING, pose(0.5, 0.5))
+    start = (transform_points(rest.implant_to_world, points) - expected).norm(dim=-1).max()
+    error = (result.warp(points) - expected).norm(dim=-1)
+    assert float(start) > 0.5
+    assert float(error.square().mean().sqrt()) < 0.03
+
+
+class _Stop(Callback):
+    """Keeps the checkpoint of the first stage, and stops there."""
+
+    checkpoint = None
+
+    def on_stage_end(self, trainer: Trainer, index: int, stage: Stage) -> None:
+        if index == 0:
+            state = trainer.state_dict()
+            self.checkpoint = {**state, "scene": {k: v.clone() for k, v in state["scene"].items()}}
+            raise InterruptedError
+
+
+def test_a_resumed_registration_ends_with_the_same_bits() -> None:
+    short = {"oversampling": 1, "iterations": 2}
+    config = PLAIN.model_copy(update={"stages": (RIGID[0], Stage(**short), Stage(groups=2, **short))})
+    data = image(scene(config, pose(2, 2)), config)
+    whole = Trainer(scene(config), data, config).fit()
+    stop = _Stop()
+    with pytest.raises(InterruptedError):
+        Trainer(scene(config), data, config, callbacks=[stop]).fit()
+    resumed = Trainer(scene(config), data, config)
+    resumed.load_state_dict(stop.checkpoint)
+    again = resumed.fit()
+    assert torch.equal(again.implant_to_world, whole.implant_to_world)
+    assert torch.equal(again.deformation.control_points, whole.deformation.control_points)
+    assert [r["loss"] for r in again.history[-2:]] == [r["loss"] for r in whole.history[-2:]]
+
+
+def test_a_checkpoint_of_another_grid_is_refused() -> None:
+    data = image(scene(PLAIN), PLAIN)
+    other = PLAIN.model_copy(update={"grid_shape": (4, 4, 12)})
+    state = Trainer(scene(other), data, other).state_dict()
+    with pytest.raises(ValueError, match="control_points"):
+        Trainer(scene(PLAIN), data, PLAIN).load_state_dict(state)
+
+
+def test_the_background_behind_the_implant_is_that_around_it() -> None:
+    config = PLAIN.model_copy(update={"material": "steel", "scatter": 0.05})
+    here = scene(config, components=[SCREW])
+    share = torch.full((3, 160, 96), 0.4)
+    modelled = image(here, config, background=share)
+    # the open beam of a measurement holds no scatter, the model's line integrals count from one that does
+    data = RegistrationData(modelled.geometry, modelled.line_integrals - math.log(1.05))
+    estimate = estimate_background(here, data, config)
+    torch.testing.assert_close(estimate, share, atol=0.02, rtol=0)
+
+
+def test_the_scatter_floor_is_estimated() -> None:
+    config = RegistrationConfig(
+        material="steel", scatter=0.1, stages=(Stage(estimate=("scatter",), tolerance=1e-4),), **GRID
+    )
+    data = image(scene(config, pose(0.2, 0.2)), config)
+    guess = config.model_copy(update={"scatter": 0.03})
+    result = register(plate(), data, guess)
+    assert result.intensity["scatter"] == pytest.approx(0.1, abs=0.005)
+
+
+def test_masked_pixels_do_not_matter_even_when_they_are_not_numbers() -> None:
+    data = image(scene(PLAIN, pose(1, 1)), PLAIN)
+    broken = data.line_integrals.clone()
+    broken[:, 70:74, 40:44] = float("nan")
+    hole = RegistrationData(data.geometry, broken)
+    assert int((~hole.mask).sum()) == 3 * 16
+    result = register(plate(), hole, PLAIN)
+    points = plate().points.double()
+    error = (result.warp(points) - transform_points(pose(1, 1), points)).norm(dim=-1)
+    assert float(error.max()) < 0.05
+
+
+def test_a_window_sees_what_the_whole_detector_sees() -> None:
+    data = image(scene(PLAIN), PLAIN)
+    points = plate().points
+    window = data.windowed(points, 10)
+    uv, _ = data.geometry.project(points[:5].double())
+    inside, _ = window.geometry.project(points[:5].double())
+    for view in range(3):
+        offset = (uv - inside)[view, 0].round().long()
+        u, v = inside[view, 0].round().long().tolist()
+        assert window.line_integrals[view, v, u] == data.line_integrals[view, v + offset[1], u + offset[0]]
+    torch.testing.assert_close((uv - inside).std(dim=1), torch.zeros(3, 2, dtype=uv.dtype), atol=1e-9, rtol=0)
+
+
+def test_data_that_do_not_fit_are_refused() -> None:
+    views = geometry()
+    with pytest.raises(ValueError, match="3 views, the projections have 2"):
+        RegistrationData(views, torch.zeros(2, 160, 96))
+    with pytest.raises(ValueError, match="detector"):
+        RegistrationData(views, torch.zeros(3, 96, 160))
+    empty = torch.ones(3, 160, 96, dtype=torch.bool)
+    empty[1] = False
+    with pytest.raises(ValueError, match="view 1"):
+        RegistrationData(views, torch.zeros(3, 160, 96), empty)
+    far = RegistrationData(views, torch.zeros(3, 160, 96))
+    with pytest.raises(ValueError, match="outside every view"):
+        Trainer(scene(PLAIN, pose(300, 0)), far, PLAIN).check()
+
+
+def test_unknown_options_are_refused_and_presets_end_with_ten_groups() -> None:
+    with pytest.raises(ValidationError):
+        RegistrationConfig(gruops=3)
+    for preset in ("gauss-newton", "paper", "adam"):
+        stages = preset_stages(preset)
+        assert stages[0].groups == 1 and stages[-1].groups == 10
+    assert {s.optimizer for s in preset_stages("paper")} == {"cmaes"}
+    assert all(s.population == 40 and s.iterations == 400 for s in preset_stages("paper")[1:])
+
+
+def test_a_result_warps_points_and_flags_those_outside_the_grid() -> None:
+    here = scene(PLAIN, pose(1, 2))
+    result = RegistrationResult(here.implant_to_world, here.deformation, torch.ones(3), [], PLAIN)
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 500.0]])
+    torch.testing.assert_close(result.warp(points), transform_points(pose(1, 2), points.double()))
+    assert result.outside(points).tolist() == [False, True]

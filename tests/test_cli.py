@@ -1,0 +1,330 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import torchkcreg
+from torchkcreg.cli import main
+from torchkcreg.geometry import transform_points
+from torchkcreg.io import read_components, read_geometry, read_points, read_projections, read_run, write_json
+
+FIGURES = {"overlay.png", "displacement.png", "history.png"}
+RUN_FILES = {"config.yaml", "versions.json", "checkpoint.pt", "history.json", "metrics.json", "deformation.json"}
+EXPORTS = {"dvf.mha", "bspline.tfm", "implant_deformed.ply"}
+
+
+def command(case, out, **changes):
+    """Arguments of a quick registration; a change of None leaves the flag out."""
+    flags = {
+        "implant": case / "implant.stl",
+        "geometry": case / "geometry.json",
+        "projections": case / "projections.npz",
+        "components": case / "screws.json",
+        "spectrum": case / "spectrum.csv",
+        "config": case / "quick.yaml",
+        "material": "steel",
+        "out": out,
+        **changes,
+    }
+    return ["register", *(f"--{k.replace('_', '-')}={v}" for k, v in flags.items() if v is not None)]
+
+
+@pytest.fixture(scope="module")
+def finished(small_case, tmp_path_factory):
+    """A run folder."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    assert main(command(small_case, out)) == 0
+    return out
+
+
+def the_error(capsys, name="register"):
+    """The error's text: the only line that is neither a warning nor empty."""
+    lines = capsys.readouterr().err.splitlines()
+    errors = [line for line in lines if not line.startswith(f"torchkcreg {name}: warning: ")]
+    assert len(errors) == 1, lines
+    assert errors[0].startswith(f"torchkcreg {name}: error: ")
+    return errors[0]
+
+
+def rejected(arguments, out, capsys):
+    """The error of a registration that must fail before anything is written."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    assert not out.exists()
+    return the_error(capsys)
+
+
+def test_a_registration_leaves_a_whole_run_folder(finished):
+    assert {entry.name for entry in finished.iterdir()} == RUN_FILES | EXPORTS | FIGURES
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert len(metrics["gc"]) == 3
+    assert min(metrics["gc"]) > 0.8
+    assert metrics["warnings"] == []
+
+
+def test_a_registration_finds_most_of_the_motion(small_case, finished, tmp_path):
+    before, after = (read_points(small_case / f"{name}.csv") for name in ("before", "after"))
+    arguments = ["warp", f"--run={finished}", f"--points={small_case / 'before.csv'}", f"--out={tmp_path / 'w.csv'}"]
+    assert main(arguments) == 0
+    warped = read_points(tmp_path / "w.csv")
+    start, end = ((p - after).square().sum(-1).mean().sqrt().item() for p in (before, warped))
+    assert end < 0.5 * start
+    torch.testing.assert_close(warped, read_run(finished).warp(before), rtol=0, atol=1e-6)
+
+
+def test_warp_flags_points_beyond_the_control_points(finished, tmp_path, capsys):
+    (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n0,0,500\n")
+    assert (
+        main(["warp", f"--run={finished}", f"--points={tmp_path / 'points.csv'}", f"--out={tmp_path / 'w.csv'}"]) == 0
+    )
+    lines = (tmp_path / "w.csv").read_text().splitlines()
+    assert lines[0] == "x,y,z,outside"
+    assert [line.rsplit(",", 1)[1] for line in lines[1:]] == ["0", "1"]
+    assert "1 of 2 points lie beyond the control points" in capsys.readouterr().err
+
+
+def test_evaluate_prints_and_writes_the_error(small_case, finished, tmp_path, capsys):
+    points, truth = small_case / "before.csv", small_case / "after.csv"
+    flags = [f"--run={finished}", f"--points={points}", f"--truth={truth}", f"--out={tmp_path / 'e.json'}"]
+    assert main(["evaluate", *flags]) == 0
+    metrics = json.loads((tmp_path / "e.json").read_text())
+    errors = (read_run(finished).warp(read_points(points)) - read_points(truth)).norm(dim=-1)
+    assert metrics["rmse_mm"] == pytest.approx(errors.square().mean().sqrt().item())
+    assert f"RMSE {metrics['rmse_mm']:.3f} mm" in capsys.readouterr().out
+
+
+def test_info_describes_each_file_in_its_own_words(small_case, finished, capsys):
+    names = ("implant.stl", "geometry.json", "projections.npz")
+    assert main(["info", *(str(small_case / name) for name in names), str(finished)]) == 0
+    out = capsys.readouterr().out
+    for text in ("13.5 x 4.6 x 188 mm", "3 views of 192 x 80 pixels", "source T1", "control points in 2 groups"):
+        assert text in out
+
+
+def test_info_alone_says_what_is_installed_and_which_projector_runs(capsys):
+    assert main(["info"]) == 0
+    out = capsys.readouterr().out
+    assert f"torch {torch.__version__}" in out
+    assert "projector backend " in out
+
+
+def test_info_of_a_file_of_another_kind_is_an_error(small_case, capsys):
+    assert main(["info", str(small_case / "spectrum.csv")]) == 2
+    assert "none of what can be described" in the_error(capsys, "info")
+
+
+def test_the_same_seed_gives_the_same_bits(small_case, finished, tmp_path):
+    assert main(command(small_case, tmp_path / "again", seed=0)) == 0
+    assert (tmp_path / "again" / "deformation.json").read_text() == (finished / "deformation.json").read_text()
+
+
+def test_a_runs_own_config_repeats_it(small_case, finished, tmp_path):
+    arguments = command(small_case, tmp_path / "again", config=finished / "config.yaml", material=None)
+    assert main([*arguments, "--no-figures"]) == 0
+    assert (tmp_path / "again" / "deformation.json").read_text() == (finished / "deformation.json").read_text()
+    assert not (tmp_path / "again" / "overlay.png").exists()
+
+
+def test_the_implants_frame_does_not_matter(small_case, finished, tmp_path):
+    """CAD frame: the mesh is turned and shifted, and init.json says so."""
+    pose = torch.tensor([[0.0, 0, 1, 5], [1, 0, 0, -7], [0, 1, 0, 9], [0, 0, 0, 1]], dtype=torch.float64)
+    back = torch.linalg.inv(pose)
+    mesh = trimesh.load(small_case / "implant.stl")
+    mesh.apply_transform(back.numpy())
+    mesh.export(tmp_path / "cad.stl")
+    ends = [
+        transform_points(back, torch.tensor([c.start, c.end]).double()).tolist()
+        for c in read_components(small_case / "screws.json")
+    ]
+    screws = [{"from": start, "to": end, "radius": 2.0, "material": "steel"} for start, end in ends]
+    write_json(tmp_path / "screws.json", {"screws": screws})
+    write_json(tmp_path / "init.json", {"implant_to_world": pose})
+    files = {"implant": "cad.stl", "components": "screws.json", "init": "init.json"}
+    arguments = command(small_case, tmp_path / "run", **{flag: tmp_path / name for flag, name in files.items()})
+    assert main([*arguments, "--no-figures"]) == 0
+    points = read_points(small_case / "before.csv")
+    turned = read_run(tmp_path / "run").warp(transform_points(back, points))
+    torch.testing.assert_close(turned, read_run(finished).warp(points), rtol=0, atol=0.15)
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten_unasked(small_case, finished, capsys):
+    before = {entry: entry.stat().st_mtime_ns for entry in finished.iterdir()}
+    capsys.readouterr()
+    assert main(command(small_case, finished)) == 2
+    assert "holds a run already" in the_error(capsys)
+    assert {entry: entry.stat().st_mtime_ns for entry in finished.iterdir()} == before
+
+
+def test_a_run_is_resumed_only_with_the_options_and_files_it_was_started_with(small_case, finished, capsys):
+    capsys.readouterr()
+    assert main([*command(small_case, finished, pitch=2.0), "--resume"]) == 2
+    assert "started with other options: pitch_mm" in the_error(capsys)
+    assert main([*command(small_case, finished, views="0,1"), "--resume"]) == 2
+    assert "started with other files: views" in the_error(capsys)
+    assert read_run(finished).config.pitch_mm == 1.0
+
+
+def test_there_must_be_a_run_to_resume(small_case, tmp_path, capsys):
+    assert "no run to resume" in rejected(
+        [*command(small_case, tmp_path / "run"), "--resume"], tmp_path / "run", capsys
+    )
+
+
+def test_bad_pixels_are_masked_counted_and_said_in_one_line(small_case, tmp_path, capsys):
+    with np.load(small_case / "projections.npz") as file:
+        intensity, open_beam = file["intensity"].astype(np.float32), file["open_beam"]
+    intensity[0, 90:93, 40] = np.nan
+    intensity[1, 10, 10:12] = 0
+    np.savez(tmp_path / "bad.npz", intensity=intensity, open_beam=open_beam)
+    out = tmp_path / "run"
+    arguments = command(small_case, out, projections=tmp_path / "bad.npz", views="0,2")
+    assert main([*arguments, "--no-figures"]) == 0
+    (warning,) = capsys.readouterr().err.splitlines()
+    said = "3 pixels are masked (3 not finite)"
+    assert warning.startswith("torchkcreg register: warning: ")
+    assert said in warning
+    assert said in read_run(out).warnings[0]
+    assert said in json.loads((out / "metrics.json").read_text())["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"implant": "nowhere.stl"}, "mesh file nowhere.stl does not exist"),
+        ({"geometry": "nowhere.json"}, "geometry file nowhere.json does not exist"),
+        ({"projections": "nowhere.npz"}, "projections file nowhere.npz does not exist"),
+        ({"material": "unobtainium"}, "unobtainium"),
+        ({"preset": "fast"}, "preset"),
+        ({"backend": "fortran"}, "backend"),
+        ({"backend": "triton"}, "triton"),
+        ({"device": "cuda:7"}, "device must be cpu"),
+        ({"pitch": -1}, "pitch_mm"),
+        ({"pitch": "fine"}, "--pitch"),
+        ({"seed": "x"}, "--seed"),
+        ({"views": "0,one"}, "views must be integers"),
+        ({"views": "0,3"}, "there is no view 3"),
+        ({"views": "-1"}, "there is no view -1"),
+        ({"views": "0,1,0"}, "got view 0 2 times"),
+        ({"material": None}, "a spectrum needs the implant's material"),
+        ({"open_beam": -5}, "open_beam must be positive"),
+        ({"colour": "red"}, "unrecognized arguments: --colour=red"),
+    ],
+)
+def test_a_wrong_flag_is_one_line_that_names_it(small_case, tmp_path, capsys, changes, message):
+    capsys.readouterr()
+    assert main(command(small_case, tmp_path / "run", **changes)) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "error: " in line
+    assert message in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_open_mesh_is_an_error_that_counts_the_edges(small_case, tmp_path, capsys):
+    mesh = trimesh.load(small_case / "implant.stl")
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    mesh.export(tmp_path / "open.stl")
+    out = tmp_path / "run"
+    assert "3 open edges" in rejected(command(small_case, out, implant=tmp_path / "open.stl"), out, capsys)
+
+
+def test_a_mesh_in_metres_is_noticed_and_its_size_said(small_case, tmp_path, capsys):
+    mesh = trimesh.load(small_case / "implant.stl")
+    mesh.apply_scale(0.001)
+    mesh.export(tmp_path / "metres.stl")
+    assert main(command(small_case, tmp_path / "run", implant=tmp_path / "metres.stl")) == 2
+    warning, error = capsys.readouterr().err.splitlines()
+    assert "0.0135 x 0.0046 x 0.188 mm: it is probably in metres" in warning
+    assert "0.0135 x 0.0046 x 0.188 mm, too small" in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_implant_outside_every_view_is_an_error(small_case, tmp_path, capsys):
+    mesh = trimesh.load(small_case / "implant.stl")
+    mesh.apply_translation((0.0, 0.0, 900.0))
+    mesh.export(tmp_path / "far.stl")
+    out = tmp_path / "run"
+    assert "outside every view" in rejected(command(small_case, out, implant=tmp_path / "far.stl"), out, capsys)
+
+
+def arrays_of(case):
+    with np.load(case / "projections.npz") as file:
+        return file["intensity"], file["open_beam"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda i, b: {"intensity": i[:2], "open_beam": b}, "(2, 192, 80), the geometry has (3, 192, 80)"),
+        (lambda i, b: {"intensity": i[:, :, 1:], "open_beam": b}, "(3, 192, 79), the geometry has (3, 192, 80)"),
+        (lambda i, b: {"intensity": i[0], "open_beam": b}, "shape (V, rows, cols)"),
+        (lambda i, b: {"intensity": i}, "open_beam"),
+        (lambda i, b: {"intensity": 0 * i, "open_beam": b}, "no valid pixel is left in view 0, 1, 2"),
+        (lambda i, b: {"images": i}, "needs either intensity"),
+    ],
+)
+def test_projections_that_do_not_fit_are_an_error(small_case, tmp_path, capsys, change, message):
+    np.savez(tmp_path / "wrong.npz", **change(*arrays_of(small_case)))
+    out = tmp_path / "run"
+    assert message in rejected(command(small_case, out, projections=tmp_path / "wrong.npz"), out, capsys)
+
+
+@pytest.mark.parametrize(
+    ("flag", "text", "message"),
+    [
+        ("geometry", "{", "not valid JSON"),
+        ("geometry", '{"views": []}', "at least one view"),
+        ("components", "[1, 2", "not valid JSON"),
+        ("components", '{"screws": [{"from": [0, 0, 0]}]}', "screw 0 has no 'to'"),
+        ("init", '{"pose": 1}', "no 'implant_to_world'"),
+        ("init", "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]", "must be rigid"),
+        ("spectrum", "energy,weight\n", "holds no rows"),
+        ("config", "pitch: 1\n", "pitch: Extra inputs are not permitted"),
+        ("config", "stages: [{bins: 2}]\n", "stages.0.bins: Extra inputs are not permitted"),
+        ("config", "preset: [\n", "not valid YAML"),
+        ("config", "stages: [{bin: 64}]\n", "too few for a stage that bins 64"),
+        ("config", "beta: -1\n", "beta"),
+    ],
+)
+def test_a_file_with_wrong_content_is_an_error_that_names_file_and_key(
+    small_case, tmp_path, capsys, flag, text, message
+):
+    path = tmp_path / "wrong.file"
+    path.write_text(text)
+    out = tmp_path / "run"
+    error = rejected(command(small_case, out, **{flag: path}), out, capsys)
+    assert message in error
+    assert ("the detector has" in error) or str(path) in error
+
+
+def test_views_in_another_order_are_other_views(small_case):
+    """The fixture's views differ, so the tests of selections can fail."""
+    geometry = read_geometry(small_case / "geometry.json")
+    projections = read_projections(small_case / "projections.npz")
+    assert geometry.sources == ("T1", "T2", "T3")
+    assert not torch.equal(projections.line_integrals[0], projections.line_integrals[1])
+
+
+def test_missing_runs_and_points_are_errors(small_case, finished, tmp_path, capsys):
+    out = f"--out={tmp_path / 'w.csv'}"
+    assert main(["warp", f"--run={tmp_path / 'no'}", f"--points={small_case / 'before.csv'}", out]) == 2
+    assert "does not exist" in the_error(capsys, "warp")
+    assert main(["warp", f"--run={finished}", f"--points={tmp_path / 'no.csv'}", out]) == 2
+    assert "does not exist" in the_error(capsys, "warp")
+    (tmp_path / "text.csv").write_text("x,y,z\n1,2,three\n")
+    assert main(["warp", f"--run={finished}", f"--points={tmp_path / 'text.csv'}", out]) == 2
+    assert "line 2" in the_error(capsys, "warp")
+    assert not (tmp_path / "w.csv").exists()
+
+
+def test_the_module_runs_as_a_program_and_knows_its_version():
+    done = subprocess.run([sys.executable, "-m", "torchkcreg", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == f"torchkcreg {torchkcreg.__version__}"
+
+
+def test_no_command_is_an_error(capsys):
+    assert main([]) == 2
+    assert capsys.readouterr().err == "torchkcreg: error: the following arguments are required: COMMAND\n"

@@ -1,0 +1,69 @@
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "torchkcreg"
+FLOORS = {
+    "geometry": 1,
+    "physics": 1,
+    "similarity": 1,
+    "implant": 2,
+    "deformation": 2,
+    "projector": 2,
+    "registration": 3,
+    "reconstruction": 3,
+    "simulation": 3,
+    "io": 4,
+    "evaluation": 4,
+    "visualization": 4,
+    "experiments": 5,
+    "cli": 6,
+}
+FOLDERS = sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file())
+
+
+def imports_of(path: Path) -> set[str]:
+    """Folders (or top-level modules) of the package that a file imports, lazily or not."""
+    package = ["torchkcreg", *path.relative_to(PACKAGE).parts[:-1]]
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level:
+            base = package[: len(package) - node.level + 1]
+            modules = [".".join([*base, *(node.module or "").split("."), alias.name]) for alias in node.names]
+            modules = [module.replace("..", ".") for module in modules]
+        elif isinstance(node, ast.ImportFrom):
+            modules = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        parts = [module.split(".") for module in modules]
+        found |= {part[1] for part in parts if part[0] == "torchkcreg" and len(part) > 1}
+    return found
+
+
+def test_every_folder_has_a_floor():
+    assert set(FOLDERS) <= FLOORS.keys()
+
+
+def test_the_floors_are_seen_to_be_used():
+    assert "geometry" in imports_of(PACKAGE / "registration" / "trainer.py")
+    assert "projector" in imports_of(PACKAGE / "projector" / "point_cloud.py")
+
+
+@pytest.mark.parametrize("folder", [*FOLDERS, "cli"])
+def test_a_folder_imports_only_from_lower_floors_and_knows_none_on_its_own(folder):
+    files = sorted((PACKAGE / folder).rglob("*.py")) if folder != "cli" else [PACKAGE / "cli.py"]
+    assert files
+    for path in files:
+        where = path.relative_to(PACKAGE)
+        assert imports_of(path) <= FLOORS.keys(), f"{where} imports from the package's top, which holds every floor"
+        for other in imports_of(path) - {folder}:
+            assert FLOORS[other] < FLOORS[folder], f"{where} (floor {FLOORS[folder]}) imports {other}"
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_file_has_one_subject_and_stays_short(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 260
+    assert path.name != "utils.py"

@@ -1,0 +1,158 @@
+"""The input files of a registration, read and checked against each other."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import trimesh
+from torch import Tensor
+
+from torchkcreg.implant import Component, ImplantPointCloud
+from torchkcreg.io import (
+    read_components,
+    read_geometry,
+    read_init,
+    read_mesh,
+    read_projections,
+    read_spectrum,
+)
+from torchkcreg.physics import Spectrum, material
+from torchkcreg.projector.ops import choose_backend
+from torchkcreg.registration import RegistrationConfig, RegistrationData
+
+_FEWEST_NODES_ALONG = 4
+_FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
+
+
+@dataclass(frozen=True)
+class RegistrationFiles:
+    """The files of a registration.
+
+    Attributes:
+        implant: Closed mesh of the undeformed implant, mm.
+        geometry: Projection matrices.
+        projections: Intensities or line integrals.
+        spectrum: Detected spectrum; None takes a 90 kV tungsten spectrum where a material is named.
+        components: Screws that move with the implant.
+        init: Approximate pose.
+        views: Views to use; None takes all.
+        open_beam: Unattenuated intensity where the projections' file does not say it.
+        config: Options as YAML or JSON.
+    """
+
+    implant: Path
+    geometry: Path
+    projections: Path
+    spectrum: Path | None = None
+    components: Path | None = None
+    init: Path | None = None
+    views: list[int] | None = None
+    open_beam: float | None = None
+    config: Path | None = None
+
+
+@dataclass(frozen=True)
+class RegistrationInputs:
+    """What the files hold.
+
+    Attributes:
+        implant: Nodes of the undeformed implant.
+        data: Projections and geometry of the views to use.
+        components: Screws and the like.
+        spectrum: Detected spectrum, where one was given.
+        implant_to_world: Start pose (4, 4), where one was given.
+        warnings: What a user should know about them, a line each.
+    """
+
+    implant: ImplantPointCloud
+    data: RegistrationData
+    components: list[Component]
+    spectrum: Spectrum | None
+    implant_to_world: Tensor | None
+    warnings: list[str]
+
+
+def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationInputs:
+    """The inputs of a registration; nothing is written.
+
+    Raises:
+        ValueError: If a file is malformed, files do not fit together, or an option cannot be had here.
+        FileNotFoundError: If a file is missing.
+    """
+    _check_options(files, config)
+    with _noted() as notes:
+        data = _read_data(files, config)
+        spectrum = read_spectrum(files.spectrum) if files.spectrum else None
+        specs = read_components(files.components) if files.components else []
+        pose = read_init(files.init) if files.init else None
+        mesh = read_mesh(files.implant)
+        _check_size(files.implant, mesh, config.pitch_mm)
+        components = [
+            Component.screw(c.name, c.start, c.end, c.radius, material=c.material, pitch=config.pitch_mm) for c in specs
+        ]
+        implant = ImplantPointCloud.from_mesh(mesh, config.pitch_mm)
+    return RegistrationInputs(implant, data, components, spectrum, pose, notes)
+
+
+def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:
+    if config.device != "cpu":
+        raise ValueError(f"device must be cpu in this version, got {config.device!r}")
+    choose_backend(torch.empty(0), config.backend)
+    if config.material is not None:
+        material(config.material)
+    elif files.spectrum is not None:
+        raise ValueError("a spectrum needs the implant's material: name it with --material")
+    views = files.views or []
+    if twice := sorted({view for view in views if views.count(view) > 1}):
+        raise ValueError(f"views must be distinct, got view {twice[0]} {views.count(twice[0])} times")
+
+
+def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationData:
+    geometry = read_geometry(files.geometry)
+    projections = read_projections(files.projections, open_beam=files.open_beam)
+    projections.check_against(geometry)
+    if files.views is not None:
+        projections = (
+            read_projections(files.projections, open_beam=files.open_beam, views=files.views)
+            if projections.num_masked  # counted anew, in these views alone
+            else projections.select(files.views)
+        )
+        geometry = geometry.select(files.views)
+    if projections.num_masked:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in projections.num_masked.items())
+        total = sum(projections.num_masked.values())
+        warnings.warn(f"projections file {files.projections}: {total} pixels are masked ({reasons})", stacklevel=2)
+    largest = max(stage.bin for stage in config.schedule())
+    if min(geometry.det_shape) < _FEWEST_PIXELS * largest:
+        rows, cols = geometry.det_shape
+        raise ValueError(f"the detector has {rows} x {cols} pixels, too few for a stage that bins {largest} into one")
+    return RegistrationData(geometry, projections.line_integrals, projections.mask)
+
+
+def _check_size(path: Path, mesh: trimesh.Trimesh, pitch_mm: float) -> None:
+    if mesh.extents.max() < _FEWEST_NODES_ALONG * pitch_mm:
+        size = " x ".join(f"{extent:.3g}" for extent in mesh.extents)
+        raise ValueError(
+            f"the implant in {path} is {size} mm, too small for nodes {pitch_mm:g} mm apart: is the mesh in metres?"
+        )
+
+
+@contextmanager
+def _noted() -> Iterator[list[str]]:
+    """The texts of a block's warnings, a line each; at its end, be it an error, they are given once."""
+    notes: list[str] = []
+    caught: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield notes
+    finally:
+        texts = [" ".join(str(w.message).split()) for w in caught if issubclass(w.category, UserWarning)]
+        notes.extend(dict.fromkeys(texts))
+        for note in notes:
+            warnings.warn(note, stacklevel=4)

@@ -1,0 +1,159 @@
+"""The DRRs of a stage as a function of the motions of control-point groups."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchkcreg.deformation import cluster_control_points, control_point_masses, group_centers, group_moments
+from torchkcreg.geometry import fit_rigid, transform_points
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.projector import cell_footprint, project_points
+
+from .config import RegistrationConfig, Stage
+from .data import RegistrationData
+from .motion import GroupMotion
+from .nuisance import Nuisance
+from .scene import Scene
+
+
+@dataclass(frozen=True)
+class _MaterialCloud:
+    """Nodes of one material: the implant's own, if it is of it, then those of components."""
+
+    holds_implant: bool
+    components: list[tuple[int, Tensor]]  # index in the scene, nodes in the implant's frame
+    masses: Tensor
+
+
+@dataclass(frozen=True)
+class _Displaced:
+    """World positions (N, 3) of points at rest, and the moments (N, 4 G) by which the groups displace them."""
+
+    world: Tensor
+    moments: Tensor
+
+    def __call__(self, coefficients: Tensor) -> Tensor:
+        """World positions (K, N, 3) for motions (K, 4 G, 3) of the groups."""
+        return self.world + self.moments @ coefficients.to(self.moments)
+
+
+class StageModel:
+    """DRRs of whole batches of candidates at a stage's image scale.
+
+    Parameters are increments in mm to the scene's state when the model is made: six a group, then the estimated
+    parameters of the intensity model. Node weights are computed here, once: the displacement of a node is linear in
+    the groups' motions, ``u = sum_g W_g t_g + (R_g - I) M_g``.
+
+    Args:
+        scene: Implant, components and intensity model in their present state.
+        data: Projections at full resolution.
+        stage: Groups, image scale, nodes.
+        config: Projector backend.
+    """
+
+    def __init__(self, scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> None:
+        self.scene, self.stage, self.config = scene, stage, config
+        self.implant = _coarsened(scene.implant, stage.pitch_factor)
+        self._prepare_motion()
+        self._prepare_clouds()
+        self._prepare_images(data)
+        self.nuisance = Nuisance(scene.intensity, stage.estimate, stage.bin / stage.oversampling)
+        self.num_parameters = self.motion.num_parameters + self.nuisance.num_parameters
+
+    def _prepare_motion(self) -> None:
+        grid = self.scene.deformation.grid
+        coarse = self.scene.implant.coarsened(4)
+        self.weights = control_point_masses(grid, coarse.points, coarse.masses)
+        self.labels = cluster_control_points(grid, self.weights, self.stage.groups)
+        self.motion = GroupMotion(
+            grid.positions().double().reshape(-1, 3),
+            self.scene.deformation.control_points.detach().double().reshape(-1, 3),
+            self.labels.flatten(),
+            self.weights.flatten(),
+            group_centers(grid, self.labels),
+        )
+        self.grid_to_world = self.scene.implant_to_world @ grid.frame.to(self.scene.implant_to_world)
+        self.nodes = self._displaced(self.implant.points, torch.float32)
+        self.followed = [self._displaced(points, torch.float64) for points in self.scene.followed]
+
+    def _displaced(self, points: Tensor, dtype: torch.dtype) -> _Displaced:
+        shares, moments = group_moments(self.scene.deformation.grid, self.labels, points.double())
+        world = transform_points(self.scene.implant_to_world, points.double())
+        return _Displaced(world.to(dtype), torch.cat([shares[..., None], moments], dim=-1).flatten(1).to(dtype))
+
+    def _prepare_clouds(self) -> None:
+        self.clouds = []
+        for material in self.scene.materials:
+            members = [(i, c) for i, c in enumerate(self.scene.components) if c.material == material]
+            clouds = [_coarsened(c.cloud, self.stage.pitch_factor) for _, c in members]
+            own = [self.implant] if material == self.scene.material else []
+            masses = torch.cat([cloud.masses for cloud in [*own, *clouds]]).float()
+            nodes = [(i, cloud.points.float()) for (i, _), cloud in zip(members, clouds, strict=True)]
+            self.clouds.append(_MaterialCloud(bool(own), nodes, masses))
+
+    def _prepare_images(self, data: RegistrationData) -> None:
+        stage = self.stage
+        at_start = self.world_points(torch.zeros(1, self.motion.num_parameters, dtype=torch.float64))
+        self.data = data.binned(stage.bin)
+        if stage.margin_mm is not None:
+            margin_px = stage.margin_mm / self.data.geometry.pixel_spacing[1]
+            self.data = self.data.windowed(torch.cat([points[0] for points in at_start]), margin_px)
+        fine = self.data.geometry.refined(stage.oversampling)
+        self.matrices, self.det_shape = fine.projection_matrices.float(), fine.det_shape
+        cell = self.implant.cell.float() @ self.scene.implant_to_world[:3, :3].float().T
+        self.footprints = [cell_footprint(points[0], cell, self.matrices) for points in at_start]
+
+    @property
+    def num_nodes(self) -> int:
+        """Nodes of all materials."""
+        return sum(len(cloud.masses) for cloud in self.clouds)
+
+    def split(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Parameters (..., D) of the motion and of the intensity model."""
+        return parameters[..., : self.motion.num_parameters], parameters[..., self.motion.num_parameters :]
+
+    def motion_steps(self, parameters: Tensor) -> Tensor:
+        """Motions (K, 4 G, 3) of the groups in the grid's axes, as the moments multiply them: t_g, then R_g - I."""
+        rotations, translations = self.motion(self.split(parameters)[0])
+        turns = (rotations - torch.eye(3).to(rotations)).mT
+        return torch.cat([translations[..., None, :], turns], dim=-2).flatten(1, 2)
+
+    def world_points(self, parameters: Tensor) -> list[Tensor]:
+        """World positions (K, N_m, 3) of the nodes of each material."""
+        steps = self.motion_steps(parameters) @ self.grid_to_world[:3, :3].T
+        motions = [
+            fit_rigid(points.double().expand(len(steps), -1, -1), displaced(steps))
+            for points, displaced in zip(self.scene.followed, self.followed, strict=True)
+        ]
+        clouds = []
+        for cloud in self.clouds:
+            parts = [self.nodes(steps)] if cloud.holds_implant else []
+            parts += [transform_points(motions[i].float(), nodes) for i, nodes in cloud.components]
+            clouds.append(torch.cat(parts, dim=1))
+        return clouds
+
+    def path_lengths(self, parameters: Tensor) -> Tensor:
+        """Path lengths (K, M, V, rows, cols) of candidates (K, D) on the oversampled pixels, mm."""
+        paths = [
+            project_points(
+                points, cloud.masses, self.matrices, self.det_shape, footprint=footprint, backend=self.config.backend
+            )
+            for points, cloud, footprint in zip(
+                self.world_points(parameters), self.clouds, self.footprints, strict=True
+            )
+        ]
+        return torch.stack(paths, dim=-4)
+
+    def line_integrals(self, parameters: Tensor) -> Tensor:
+        """DRRs (K, V, rows, cols) of candidates (K, D)."""
+        physics = self.nuisance(self.split(parameters)[1])
+        if self.data.background is not None:
+            physics["background"] = self.data.background
+        return self.scene.intensity(self.path_lengths(parameters), pooling=self.stage.oversampling, **physics)
+
+
+def _coarsened(cloud: ImplantPointCloud, factor: int) -> ImplantPointCloud:
+    return cloud if factor == 1 else cloud.coarsened(factor)
