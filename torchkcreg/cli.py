@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -10,6 +11,10 @@ from pathlib import Path
 from typing import NoReturn
 
 import torchkcreg
+
+# Before torch starts its threads: where other programs use the cores too, threads that wait by spinning hold each
+# other up, and a registration takes ten times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -84,7 +89,6 @@ def _add_register(commands) -> None:
     command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
     command.add_argument("--seed", type=int, help="seed of the random numbers")
     command.add_argument("--backend", help="projector: auto, cpp, triton or torch")
-    command.add_argument("--device", help="torch device")
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
     existing = command.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
@@ -112,7 +116,7 @@ def _register(options: argparse.Namespace) -> None:
         open_beam=options.open_beam,
         config=options.config,
     )
-    names = ("material", "preset", "pitch_mm", "seed", "backend", "device")
+    names = ("material", "preset", "pitch_mm", "seed", "backend")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     result = register_files(
         files,

@@ -11,7 +11,15 @@ from torch import Tensor
 
 from torchkcreg.evaluation import displacement_map
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.registration import RegistrationData, RegistrationResult, Scene, Stage, StageModel, StageObjective
+from torchkcreg.registration import (
+    RegistrationData,
+    RegistrationResult,
+    Scene,
+    Stage,
+    StageModel,
+    StageObjective,
+    estimate_background,
+)
 from torchkcreg.visualization import displacement_figure, history_figure, overlay_figure
 
 if TYPE_CHECKING:

@@ -100,8 +100,6 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
 
 
 def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:
-    if config.device != "cpu":
-        raise ValueError(f"device must be cpu in this version, got {config.device!r}")
     choose_backend(torch.empty(0), config.backend)
     if config.material is not None:
         material(config.material)

@@ -220,7 +220,7 @@ class ConeBeamGeometry(nn.Module):
         return self._derived(matrices, det_shape=det_shape, pixel_spacing=[d * factor for d in self.pixel_spacing])
 
     def refined(self, factor: int) -> ConeBeamGeometry:
-        """The geometry of pixels ``factor`` times finer, the inverse of :meth:`bin`: ``u' = factor u + (factor - 1)/2``."""
+        """The geometry of pixels ``factor`` times finer, ``u' = factor u + (factor - 1)/2``; undoes :meth:`bin`."""
         if int(factor) != factor or factor < 1:
             raise ValueError(f"factor must be a positive integer, got {factor}")
         matrices = self._rescaled([-(factor - 1) / (2 * factor)] * 2, factor)

@@ -25,8 +25,8 @@ def polyenergetic_line_integrals(
 ) -> Tensor:
     """Line integrals `(K, V, rows, cols)` of materials' path lengths `(K, M, V, rows, cols)`.
 
-    `y = -ln(b blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`, candidate by candidate; only images of the size of
-    the result are kept for the gradient, whatever the number of energies.
+    `y = -ln(b blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`, candidate by candidate; only images of the size
+    of the result are kept for the gradient, whatever the number of energies.
 
     Args:
         path_lengths: Path lengths in mm, `(K, M, V, rows, cols)`.

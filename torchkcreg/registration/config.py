@@ -111,7 +111,6 @@ class RegistrationConfig(BaseModel):
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp", "triton" or "torch".
-        device: Torch device.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -130,7 +129,6 @@ class RegistrationConfig(BaseModel):
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
     backend: Literal["auto", "cpp", "triton", "torch"] = "auto"
-    device: str = "cpu"
 
     def schedule(self) -> tuple[Stage, ...]:
         """The stages that will run."""

@@ -82,7 +82,7 @@ class Trainer:
         final = self._objective(self.stages[-1])
         with torch.no_grad():
             gc = final.gradient_correlations(torch.zeros(1, final.num_parameters, dtype=torch.float64))[0]
-        intensity = {name: float(value) for name, value in scene.intensity.named_parameters()}
+        intensity = {name: float(value.detach()) for name, value in scene.intensity.named_parameters()}
         return RegistrationResult(
             implant_to_world=scene.implant_to_world.clone(),
             deformation=scene.deformation,
