@@ -3,7 +3,7 @@
 # VENV     where the environment is made                    make test VENV=/tmp/kcreg
 # PYTHON   what makes it, Python 3.10 or later              make test PYTHON=python3.12
 # TORCH    which torch, 2.10 or later                       make test TORCH=torch==2.13.0
-# TORCH_PIP_FLAGS   where from, e.g. the build without CUDA make test TORCH_PIP_FLAGS="--index-url https://download.pytorch.org/whl/cpu"
+# TORCH_PIP_FLAGS   where from: pip's --index-url of the build without CUDA, say
 # EXTRAS   what comes with the library                        make test EXTRAS=dev
 # JOBS     processes that test side by side                 make test JOBS=8
 
@@ -11,7 +11,7 @@ VENV ?= .venv
 PYTHON ?= python3
 TORCH ?= torch>=2.10
 TORCH_PIP_FLAGS ?=
-EXTRAS ?= dev,simulate
+EXTRAS ?= dev,notebooks,simulate
 JOBS ?= 2
 
 BIN := $(VENV)/bin

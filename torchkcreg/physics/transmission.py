@@ -41,9 +41,7 @@ def polyenergetic_line_integrals(
     Returns:
         Differentiable once, in everything but the attenuation.
     """
-    return _PolyenergeticLineIntegrals.apply(
-        path_lengths, attenuation, weights, kernel, scatter, pooling, background
-    )
+    return _PolyenergeticLineIntegrals.apply(path_lengths, attenuation, weights, kernel, scatter, pooling, background)
 
 
 class _PolyenergeticLineIntegrals(torch.autograd.Function):

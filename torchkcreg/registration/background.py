@@ -26,7 +26,7 @@ def estimate_background(scene: Scene, data: RegistrationData, config: Registrati
     its surroundings. It is too smooth to take over edges that the implant should explain, but behind bone or water it
     sets how much of the signal is scatter, which decides how saturated an edge looks.
     """
-    stage = Stage(bin=2, pitch_factor=2, margin_mm=None)
+    stage = Stage(groups=scene.num_groups, bin=2, pitch_factor=2, margin_mm=None)
     model = StageModel(scene, replace(data, background=None), stage, config)
     still = torch.zeros(1, model.num_parameters, dtype=torch.float64)
     physics = {**model.nuisance(model.split(still)[1]), "scatter": torch.zeros(1)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 OptimizerName = Literal["gauss-newton", "cmaes", "adam"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
@@ -129,6 +129,14 @@ class RegistrationConfig(BaseModel):
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
     backend: Literal["auto", "cpp", "triton", "torch"] = "auto"
+
+    @field_validator("stages")
+    @classmethod
+    def _groups_only_split(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+        counts = [stage.groups for stage in stages]
+        if counts != sorted(counts):
+            raise ValueError(f"groups only split: their number must not fall from stage to stage, got {counts}")
+        return stages
 
     def schedule(self) -> tuple[Stage, ...]:
         """The stages that will run."""

@@ -52,9 +52,16 @@ class StageModel:
         data: Projections at full resolution.
         stage: Groups, image scale, nodes.
         config: Projector backend.
+
+    Raises:
+        ValueError: If the stage has fewer groups than the scene: they could not hold its bending.
     """
 
     def __init__(self, scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> None:
+        if stage.groups < scene.num_groups:
+            raise ValueError(
+                f"a stage of {stage.groups} groups cannot follow one of {scene.num_groups}: groups only split"
+            )
         self.scene, self.stage, self.config = scene, stage, config
         self.implant = _coarsened(scene.implant, stage.pitch_factor)
         self._prepare_motion()

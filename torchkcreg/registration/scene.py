@@ -55,6 +55,11 @@ class Scene(nn.Module):
         """Names of the materials in the order of the path lengths, the implant's first."""
         return list(dict.fromkeys([self.material, *(c.material for c in self.components)]))
 
+    @property
+    def num_groups(self) -> int:
+        """Groups of control points that the deformation has been split into so far."""
+        return int(self.deformation.labels.max()) + 1
+
     @torch.no_grad()
     def component_motions(self) -> dict[str, Tensor]:
         """Rigid motion (4, 4) of each component in the implant's frame."""
