@@ -104,7 +104,8 @@ class RegistrationConfig(BaseModel):
         grid_spacing_mm: Spacing of the control points, mm.
         beta: Weight of the diffusion penalty (eq. 5).
         stiffness: Weight of the elastic energy of the implant's own material, as its mean density over Young's modulus.
-            That is half a squared strain: 300 charges 1e-4 of GC for strains of about 1e-3, where steel yields.
+            That is half a squared strain: 30 charges 1e-5 of GC for strains of 1e-3, where steel yields, and 1e-3
+            for strains of 1e-2.
         scatter: Initial scatter floor, as a fraction of the open beam.
         blur_px: Initial standard deviation of the detector's blur, pixels.
         background_mm: Smoothness of the estimated background, standard deviation in mm at the detector.
@@ -122,7 +123,7 @@ class RegistrationConfig(BaseModel):
     grid_shape: tuple[int, int, int] = (6, 6, 10)
     grid_spacing_mm: tuple[float, float, float] = (8.75, 8.75, 25.0)
     beta: float = Field(1e-4, ge=0)
-    stiffness: float = Field(300.0, ge=0)
+    stiffness: float = Field(30.0, ge=0)
     scatter: float = Field(0.05, ge=0, lt=1)
     blur_px: float = Field(0.7, ge=0)
     background_mm: float = Field(4.0, gt=0)
