@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -17,8 +16,7 @@ from torchkcreg.registration import (
     Scene,
     Stage,
     StageModel,
-    StageObjective,
-    estimate_background,
+    stage_objective,
 )
 from torchkcreg.visualization import displacement_figure, history_figure, overlay_figure
 
@@ -81,17 +79,14 @@ def _drr(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Te
     groups = result.config.schedule()[-1].groups  # fewer could not hold the result's bending
     stage = Stage(groups=groups, bin=1, pitch_factor=2, oversampling=1, margin_mm=None)
     model = StageModel(scene, data, stage, result.config)
-    return model.path_lengths(torch.zeros(1, model.num_parameters, dtype=torch.float64))[0].sum(dim=0)
+    return model.path_lengths(model.at_rest)[0].sum(dim=0)
 
 
 @torch.no_grad()
 def _similarity(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Tensor:
     """GC (V,) as the last stage has it, so that start and result are measured alike."""
-    stage = result.config.schedule()[-1]
-    if stage.background and hasattr(scene.intensity, "scatter"):
-        data = replace(data, background=estimate_background(scene, data, result.config))
-    objective = StageObjective(scene, data, stage, result.config)
-    return objective.gradient_correlations(torch.zeros(1, objective.num_parameters, dtype=torch.float64))[0]
+    objective = stage_objective(scene, data, result.config.schedule()[-1], result.config)
+    return objective.gradient_correlations(objective.model.at_rest)[0]
 
 
 def _labels(geometry: ConeBeamGeometry, views: list[int]) -> list[str]:

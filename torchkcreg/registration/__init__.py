@@ -9,7 +9,7 @@ from .objective import StageObjective
 from .register import build_scene, register
 from .result import RegistrationResult
 from .scene import Scene
-from .trainer import Trainer
+from .trainer import Trainer, stage_objective
 
 __all__ = [
     "Callback",
@@ -26,4 +26,5 @@ __all__ = [
     "estimate_background",
     "preset_stages",
     "register",
+    "stage_objective",
 ]

@@ -28,9 +28,8 @@ def estimate_background(scene: Scene, data: RegistrationData, config: Registrati
     """
     stage = Stage(groups=scene.num_groups, bin=2, pitch_factor=2, margin_mm=None)
     model = StageModel(scene, replace(data, background=None), stage, config)
-    still = torch.zeros(1, model.num_parameters, dtype=torch.float64)
-    physics = {**model.nuisance(model.split(still)[1]), "scatter": torch.zeros(1)}
-    paths = model.path_lengths(still)
+    physics = {**model.nuisance(model.split(model.at_rest)[1]), "scatter": torch.zeros(1)}
+    paths = model.path_lengths(model.at_rest)
     scatter = float(scene.intensity.get_parameter("scatter").detach())
     known = torch.exp(-scene.intensity(paths, pooling=stage.oversampling, **physics))[0]
     excess = torch.exp(-model.data.line_integrals) - scatter

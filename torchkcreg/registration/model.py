@@ -118,6 +118,11 @@ class StageModel:
         """Nodes of all materials."""
         return sum(len(cloud.masses) for cloud in self.clouds)
 
+    @property
+    def at_rest(self) -> Tensor:
+        """The candidate (1, D) that leaves the scene as it is."""
+        return torch.zeros(1, self.num_parameters, dtype=torch.float64)
+
     def split(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Parameters (..., D) of the motion and of the intensity model."""
         return parameters[..., : self.motion.num_parameters], parameters[..., self.motion.num_parameters :]

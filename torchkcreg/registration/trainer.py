@@ -21,6 +21,13 @@ from .result import RegistrationResult
 from .scene import Scene
 
 
+def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
+    """The objective of a stage at the scene's present state, with the background that the stage asks for."""
+    if stage.background and hasattr(scene.intensity, "scatter"):
+        data = replace(data, background=estimate_background(scene, data, config))
+    return StageObjective(scene, data, stage, config)
+
+
 class Trainer:
     """Runs the stages of a configuration on a scene and keeps their history.
 
@@ -57,7 +64,7 @@ class Trainer:
         stage, start = self.stages[index], time.perf_counter()
         for callback in self.callbacks:
             callback.on_stage_start(self, index, stage)
-        objective = self._objective(stage)
+        objective = stage_objective(self.scene, self.data, stage, self.config)
 
         def report(progress: Progress) -> None:
             record = {"stage": index, "iteration": progress.iteration, "loss": progress.loss}
@@ -71,17 +78,11 @@ class Trainer:
         for callback in self.callbacks:
             callback.on_stage_end(self, index, stage)
 
-    def _objective(self, stage: Stage) -> StageObjective:
-        data = self.data
-        if stage.background and hasattr(self.scene.intensity, "scatter"):
-            data = replace(data, background=estimate_background(self.scene, data, self.config))
-        return StageObjective(self.scene, data, stage, self.config)
-
     def _result(self) -> RegistrationResult:
         scene = self.scene
-        final = self._objective(self.stages[-1])
+        final = stage_objective(scene, self.data, self.stages[-1], self.config)
         with torch.no_grad():
-            gc = final.gradient_correlations(torch.zeros(1, final.num_parameters, dtype=torch.float64))[0]
+            gc = final.gradient_correlations(final.model.at_rest)[0]
         intensity = {name: float(value.detach()) for name, value in scene.intensity.named_parameters()}
         return RegistrationResult(
             implant_to_world=scene.implant_to_world.clone(),
