@@ -327,3 +327,64 @@ def test_the_module_runs_as_a_program_and_knows_its_version():
 def test_no_command_is_an_error(capsys):
     assert main([]) == 2
     assert capsys.readouterr().err == "torchkcreg: error: the following arguments are required: COMMAND\n"
+
+
+@pytest.fixture(scope="module")
+def true_shape(small_case, finished, tmp_path_factory):
+    """Folder with what the finished run found, moved by 0.3 mm: as a mesh, in metres, and as a scan."""
+    folder = tmp_path_factory.mktemp("true_shape")
+    mesh = trimesh.load(small_case / "implant.stl").subdivide_to_size(4.0)
+    vertices = read_run(finished).warp(torch.tensor(np.asarray(mesh.vertices)))
+    mesh.vertices = (vertices + torch.tensor([0.3, 0.0, 0.0])).numpy()
+    mesh.export(folder / "true.stl")
+    np.savetxt(folder / "scan.xyz", trimesh.sample.sample_surface(mesh, 3000, seed=0)[0])
+    mesh.apply_scale(0.001)
+    mesh.export(folder / "metres.stl")
+    return folder
+
+
+def test_evaluate_compares_with_a_true_shape_prints_and_draws(finished, true_shape, tmp_path, capsys):
+    flags = [f"--run={finished}", f"--out={tmp_path / 'e.json'}", f"--figures={tmp_path / 'figures'}"]
+    capsys.readouterr()
+    assert main(["evaluate", *flags, f"--reference={true_shape / 'true.stl'}"]) == 0
+    shape = json.loads((tmp_path / "e.json").read_text())["shape"]
+    assert 0.05 < shape["surface_before"]["rmse_mm"] < 0.3
+    assert shape["surface_after"]["rmse_mm"] < 0.005
+    assert shape["shift_mm"] == pytest.approx(0.3, abs=0.02)
+    out = capsys.readouterr().out
+    assert "node to surface, after CPD" in out
+    assert "floor between perfect lattices       0.480   0.500" in out
+    pictures = {"displacement.png", "error_map.png", "histogram.png"}
+    assert {entry.name for entry in (tmp_path / "figures").iterdir()} == pictures
+
+
+def test_evaluate_takes_points_and_a_scan_at_once(small_case, finished, true_shape, tmp_path, capsys):
+    points = [f"--points={small_case / 'before.csv'}", f"--truth={small_case / 'after.csv'}"]
+    flags = [f"--run={finished}", f"--reference={true_shape / 'scan.xyz'}", f"--out={tmp_path / 'e.json'}"]
+    capsys.readouterr()
+    assert main(["evaluate", *flags, *points]) == 0
+    metrics = json.loads((tmp_path / "e.json").read_text())
+    assert metrics["num_points"] == 8
+    assert metrics["shape"]["reference"] == "surface"
+    assert metrics["shape"]["surface_after"]["rmse_mm"] < 0.01
+    assert "8 points: RMSE" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ([], "nothing to compare with"),
+        (["--points={case}/before.csv"], "points need truth"),
+        (["--truth={case}/after.csv"], "truth need points"),
+        (["--reference=nowhere.stl"], "reference file nowhere.stl does not exist"),
+        (["--reference={shape}/metres.stl"], "is the reference in metres"),
+        (["--reference={shape}/scan.xyz", "--reference-kind=line"], "--reference-kind"),
+        (["--reference={shape}/scan.xyz", "--implant=nowhere.stl"], "mesh file nowhere.stl does not exist"),
+        (["--points={case}/before.csv", "--truth={case}/after.csv", "--reference-kind=surface"], "needs a reference"),
+    ],
+)
+def test_evaluate_says_what_is_missing_or_wrong(small_case, finished, true_shape, capsys, flags, message):
+    capsys.readouterr()
+    filled = [flag.format(case=small_case, shape=true_shape) for flag in flags]
+    assert main(["evaluate", f"--run={finished}", *filled]) == 2
+    assert message in the_error(capsys, "evaluate")

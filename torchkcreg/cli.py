@@ -61,6 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_register(commands)
     _add_warp(commands)
     _add_evaluate(commands)
+    _add_reconstruct(commands)
     _add_info(commands)
     _add_demo(commands)
     return parser
@@ -152,21 +153,80 @@ def _warp(options: argparse.Namespace) -> None:
 
 
 def _add_evaluate(commands) -> None:
-    command = _command(commands, "evaluate", _evaluate, "compare a registration with known positions")
+    text = "compare a registration with known positions, or with the implant's true shape"
+    command = _command(commands, "evaluate", _evaluate, text)
     command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
-    command.add_argument("--points", type=Path, required=True, help="x,y,z before, in the implant's frame (CSV)")
-    command.add_argument("--truth", type=Path, required=True, help="x,y,z after, in the world (CSV)")
+    command.add_argument("--points", type=Path, help="x,y,z before, in the implant's frame (CSV)")
+    command.add_argument("--truth", type=Path, help="x,y,z of the same points after, in the world (CSV)")
+    shapes = "true shape of the deformed implant: mesh (STL, PLY, ...), or points (CSV, XYZ, PLY)"
+    command.add_argument("--reference", type=Path, help=shapes)
+    kinds = "what a reference's points are: nodes of its volume, or a scan of its surface (default: found out)"
+    command.add_argument("--reference-kind", choices=("volume", "surface"), help=kinds)
+    command.add_argument("--implant", type=Path, help="undeformed mesh (default: the one that the run names)")
     command.add_argument("--out", type=Path, help="JSON to write")
+    command.add_argument("--figures", type=Path, help="folder for displacement map, error map and histogram (PNG)")
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    from torchkcreg.evaluation import evaluate
-    from torchkcreg.io import read_points, read_run, write_json
+    from torchkcreg.experiments import evaluate_files
+    from torchkcreg.io import write_json
 
-    metrics = evaluate(read_run(options.run_folder), read_points(options.points), read_points(options.truth))
-    print(metrics)
+    names = ("points", "truth", "reference", "reference_kind", "implant", "figures")
+    found = evaluate_files(options.run_folder, **{name: getattr(options, name) for name in names})
+    print(found)
     if options.out:
-        write_json(options.out, metrics.to_dict())
+        write_json(options.out, found.to_dict())
+
+
+def _add_reconstruct(commands) -> None:
+    command = _command(commands, "reconstruct", _reconstruct, "make a volume from a scan: FDK, PWLS or KC-Rec")
+    command.add_argument("--method", choices=("fdk", "pwls", "kcrec"), default="fdk", help="default: fdk")
+    command.add_argument("--run", type=Path, dest="run_folder", help="registration: the implant, and files not given")
+    command.add_argument("--geometry", type=Path, help="projection matrices of all views (JSON)")
+    command.add_argument("--projections", type=Path, help="intensities or line integrals of all views (NPZ, MHA)")
+    command.add_argument("--out", type=Path, required=True, help="folder to make")
+    command.add_argument("--spectrum", type=Path, help="detected spectrum, to correct beam hardening (CSV)")
+    command.add_argument("--components", type=Path, help="screws, where the registration did not know them (JSON)")
+    command.add_argument("--open-beam", type=float, help="unattenuated intensity, where the file does not say it")
+    command.add_argument("--initial", type=Path, help="volume to start PWLS from (MHA, NIfTI)")
+    command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
+    command.add_argument("--spacing", type=float, dest="spacing_mm", help="edge of a voxel, mm (default: 0.8)")
+    command.add_argument("--size", type=float, nargs=3, dest="size_mm", metavar=("X", "Y", "Z"), help="volume, mm")
+    command.add_argument(
+        "--center", type=float, nargs=3, dest="center_mm", metavar=("X", "Y", "Z"), help="its middle, mm"
+    )
+    command.add_argument("--preset", help="momentum (50 iterations) or paper (500 of 20 subsets)")
+    command.add_argument("--iterations", type=int, help="passes through all views")
+    command.add_argument("--subsets", type=int, help="ordered subsets")
+    command.add_argument("--beta", type=float, help="weight of the roughness (default: 10)")
+    command.add_argument("--passes", type=int, help="2: correct for mineral and for scatter behind metal, from pass 1")
+    command.add_argument("--window", help="of the ramp: ram-lak, shepp-logan, cosine, hamming or hann (default)")
+    command.add_argument("--scatter", help="auto (default), none, or its fraction of the primary")
+    command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")
+    command.add_argument("--material", help="of the implant, where the registration had none")
+    command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
+    existing = command.add_mutually_exclusive_group()
+    existing.add_argument("--overwrite", action="store_true", help="replace the reconstruction that the folder holds")
+    existing.add_argument("--resume", action="store_true", help="continue the one that the folder holds")
+
+
+def _reconstruct(options: argparse.Namespace) -> None:
+    from torchkcreg.experiments import ReconstructionFiles, ReconstructionOptions, reconstruct_files, resolve_options
+
+    names = ("geometry", "projections", "spectrum", "components", "open_beam", "initial")
+    files = ReconstructionFiles(run=options.run_folder, **{name: getattr(options, name) for name in names})
+    given = {name: getattr(options, name, None) for name in ReconstructionOptions.model_fields}
+    overrides = {name: value for name, value in given.items() if value is not None}
+    metrics = reconstruct_files(
+        files,
+        options.out,
+        resolve_options(overrides, options.config),
+        overwrite=options.overwrite,
+        resume=options.resume,
+        figures=not options.no_figures,
+    )
+    depth, height, width = metrics["shape"]
+    print(f"{width} x {height} x {depth} voxels in {metrics['seconds']:.0f} s; folder {options.out}")
 
 
 def _add_info(commands) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -90,12 +91,12 @@ def test_a_checkpoint_of_another_grid_is_refused() -> None:
 def test_the_background_behind_the_implant_is_that_around_it() -> None:
     config = PLAIN.model_copy(update={"material": "steel", "scatter": 0.05})
     here = scene(config, components=[SCREW])
-    share = torch.full((3, 160, 96), 0.4)
-    modelled = image(here, config, background=share)
+    bone = torch.full((3, 160, 96), 20.0)
+    modelled = image(here, config, background=bone)
     # the open beam of a measurement holds no scatter, the model's line integrals count from one that does
     data = RegistrationData(modelled.geometry, modelled.line_integrals - math.log(1.05))
     estimate = estimate_background(here, data, config)
-    torch.testing.assert_close(estimate, share, atol=0.02, rtol=0)
+    torch.testing.assert_close(estimate, bone, atol=1.0, rtol=0)
 
 
 def test_the_scatter_floor_is_estimated() -> None:
@@ -103,6 +104,7 @@ def test_the_scatter_floor_is_estimated() -> None:
         material="steel", scatter=0.1, stages=(Stage(estimate=("scatter",), tolerance=1e-4),), **GRID
     )
     data = image(scene(config, pose(0.2, 0.2)), config)
+    data = replace(data, scatter_shape=torch.ones_like(data.line_integrals))
     guess = config.model_copy(update={"scatter": 0.03})
     result = register(plate(), data, guess)
     assert result.intensity["scatter"] == pytest.approx(0.1, abs=0.005)
@@ -148,14 +150,14 @@ def test_data_that_do_not_fit_are_refused() -> None:
         Trainer(scene(PLAIN, pose(300, 0)), far, PLAIN).check()
 
 
-def test_unknown_options_are_refused_and_presets_end_with_ten_groups() -> None:
+def test_unknown_options_are_refused_and_presets_split_groups() -> None:
     with pytest.raises(ValidationError):
         RegistrationConfig(gruops=3)
     with pytest.raises(ValidationError, match="groups only split"):
         RegistrationConfig(stages=(Stage(groups=4), Stage(groups=2)))
     for preset in ("gauss-newton", "paper", "adam"):
         stages = preset_stages(preset)
-        assert stages[0].groups == 1 and stages[-1].groups == 10
+        assert stages[0].groups == 1 and stages[-1].groups >= 10
     assert {s.optimizer for s in preset_stages("paper")} == {"cmaes"}
     assert all(s.population == 40 and s.iterations == 400 for s in preset_stages("paper")[1:])
 

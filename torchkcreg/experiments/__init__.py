@@ -1,16 +1,31 @@
 """Whole experiments: register from files to a run folder, simulate and register a demo, say what a file holds."""
 
+from torchkcreg.experiments.capture import CaptureStudy, CaptureTrial, capture_study
 from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.describe import describe, describe_installation
+from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
 from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
+from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
+from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles, ReconstructionOptions
+from torchkcreg.experiments.registered_components import registered_components
 
 __all__ = [
+    "CaptureStudy",
+    "CaptureTrial",
+    "FileEvaluation",
+    "ReconstructionFiles",
+    "ReconstructionOptions",
     "RegistrationFiles",
+    "capture_study",
     "demo",
     "describe",
     "describe_installation",
     "draw_registration",
+    "evaluate_files",
+    "reconstruct_files",
     "register_files",
+    "registered_components",
     "resolve_config",
+    "resolve_options",
 ]

@@ -13,11 +13,13 @@ from .init import read_init, write_init
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
 from .points import read_points, write_points
 from .projections import Projections, read_projections, write_projections
+from .references import read_reference
 from .results import result_from_dict, result_to_dict
 from .runs import RunFolder, read_run
 from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
 from .versions import versions
+from .volumes import read_volume, write_volume
 
 __all__ = [
     "ComponentSpec",
@@ -35,8 +37,10 @@ __all__ = [
     "read_mesh",
     "read_points",
     "read_projections",
+    "read_reference",
     "read_run",
     "read_spectrum",
+    "read_volume",
     "result_from_dict",
     "result_to_dict",
     "versions",
@@ -53,4 +57,5 @@ __all__ = [
     "write_points",
     "write_projections",
     "write_spectrum",
+    "write_volume",
 ]

@@ -101,7 +101,7 @@ class PolyenergeticTransmission(nn.Module):
         blur_sigma_px: Tensor | None = None,
         hardness: Tensor | None = None,
         pooling: int = 1,
-        background: Tensor | None = None,
+        scatter_shape: Tensor | None = None,
     ) -> Tensor:
         """Line integrals `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)` in mm.
 
@@ -113,8 +113,8 @@ class PolyenergeticTransmission(nn.Module):
             pooling: Transmissions are averaged over squares of this many pixels a side after the blur. Path lengths on
                 pixels finer than the detector's follow sharp edges better: an average of exponentials is not the
                 exponential of the average.
-            background: Share of the beam that everything but the known components lets through, b of shape
-                (V, rows, cols) after pooling: `b blur(...)` in place of `blur(...)`. One if None.
+            scatter_shape: How the scatter is spread over the detector, of shape (V, rows, cols) after pooling, as a
+                factor of `scatter`; evenly if None.
 
         Raises:
             ValueError: If the path lengths' M is not the number of materials, or an override fits no candidate axis, or
@@ -129,7 +129,7 @@ class PolyenergeticTransmission(nn.Module):
         weights = torch.softmax(self.weights.log() - hardness[:, None] * self.aluminium, dim=-1)
         flat = path_lengths.reshape(-1, *path_lengths.shape[-4:])
         result = polyenergetic_line_integrals(
-            flat, self.attenuation, weights, gaussian_kernel(sigma), floor, pooling, background
+            flat, self.attenuation, weights, gaussian_kernel(sigma), floor, pooling, scatter_shape
         )
         return result.reshape(*leading, *result.shape[-3:])
 

@@ -21,11 +21,11 @@ def polyenergetic_line_integrals(
     kernel: Tensor,
     scatter: Tensor,
     pooling: int = 1,
-    background: Tensor | None = None,
+    scatter_shape: Tensor | None = None,
 ) -> Tensor:
     """Line integrals `(K, V, rows, cols)` of materials' path lengths `(K, M, V, rows, cols)`.
 
-    `y = -ln(b blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`, candidate by candidate; only images of the size
+    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s q) + ln(1 + s)`, candidate by candidate; only images of the size
     of the result are kept for the gradient, whatever the number of energies.
 
     Args:
@@ -35,13 +35,15 @@ def polyenergetic_line_integrals(
         kernel: One-dimensional blur kernels, `(K, odd)`, applied along rows and columns.
         scatter: Scatter floors in units of the open beam, `(K,)`.
         pooling: Blurred transmissions are averaged over squares of this many pixels a side, which divides the images.
-        background: Share b of the beam that what is not modelled lets through, `(V, rows, cols)` after pooling; no
-            gradient. All of it if None.
+        scatter_shape: How the scatter is spread over the detector, q of shape `(V, rows, cols)` after pooling; no
+            gradient. Evenly, q = 1, if None.
 
     Returns:
         Differentiable once, in everything but the attenuation.
     """
-    return _PolyenergeticLineIntegrals.apply(path_lengths, attenuation, weights, kernel, scatter, pooling, background)
+    return _PolyenergeticLineIntegrals.apply(
+        path_lengths, attenuation, weights, kernel, scatter, pooling, scatter_shape
+    )
 
 
 class _PolyenergeticLineIntegrals(torch.autograd.Function):
@@ -56,9 +58,9 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
         kernel: Tensor,
         scatter: Tensor,
         pooling: int,
-        background: Tensor | None,
+        scatter_shape: Tensor | None,
     ) -> Tensor:
-        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter, background)
+        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter, scatter_shape)
         ctx.pooling = pooling
         coefficients = attenuation.tolist()
         num_candidates, _, *image_shape = path_lengths.shape
@@ -70,16 +72,15 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
             signal = transmitted(lengths, coefficients, shares).view(image_shape)
             for view in range(image_shape[0]):
                 blurred = _pooled(convolve(convolve(signal[view], blur, -2), blur, -1), pooling)
-                if background is not None:
-                    blurred = blurred * background[view]
                 out = result[candidate, view]
-                _add_floor(blurred, floor, out=out).log_().neg_().add_(_log1p(floor))
+                level = floor if scatter_shape is None else floor * scatter_shape[view]
+                _add_floor(blurred, level, out=out).log_().neg_().add_(_log1p(floor))
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        path_lengths, attenuation, weights, kernel, scatter, background = ctx.saved_tensors
+        path_lengths, attenuation, weights, kernel, scatter, scatter_shape = ctx.saved_tensors
         coefficients = attenuation.tolist()
         wants_lengths, _, wants_weights, wants_kernel, wants_scatter, *_ = ctx.needs_input_grad
         grad_lengths = torch.empty_like(path_lengths) if wants_lengths else None
@@ -90,13 +91,11 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
             signal = transmitted(lengths, coefficients, shares).view(path_lengths.shape[2:])
             along_rows = convolve(signal, blur, -2)
             blurred = _pooled(convolve(along_rows, blur, -1), ctx.pooling)
-            if background is not None:
-                blurred = blurred * background
-            grad_signal = _add_floor(blurred, floor, out=blurred).reciprocal_().mul_(upstream[candidate]).neg_()
+            level = floor if scatter_shape is None else floor * scatter_shape
+            grad_signal = _add_floor(blurred, level, out=blurred).reciprocal_().mul_(upstream[candidate]).neg_()
             if wants_scatter:
-                grad_scatter.append(float(grad_signal.sum()) + float(upstream[candidate].sum()) / (1 + floor))
-            if background is not None:
-                grad_signal = grad_signal * background
+                shaped = grad_signal if scatter_shape is None else grad_signal * scatter_shape
+                grad_scatter.append(float(shaped.sum()) + float(upstream[candidate].sum()) / (1 + floor))
             grad_signal = _spread(grad_signal, ctx.pooling)
             grad_rows = convolve_adjoint(grad_signal, blur, -1)
             if wants_kernel:
@@ -167,7 +166,7 @@ def _spread(images: Tensor, pooling: int) -> Tensor:
     return (images / pooling**2).repeat_interleave(pooling, -2).repeat_interleave(pooling, -1)
 
 
-def _add_floor(signal: Tensor, floor: float, *, out: Tensor) -> Tensor:
+def _add_floor(signal: Tensor, floor: float | Tensor, *, out: Tensor) -> Tensor:
     """Signal plus floor, kept positive: a negative floor must not turn into NaN."""
     return torch.add(signal, floor, out=out).clamp_min_(torch.finfo(signal.dtype).tiny)
 

@@ -11,7 +11,13 @@ from pathlib import Path
 import torch
 
 PACKAGE = Path(__file__).resolve().parent.parent
-SOURCES = ("csrc/ops.cpp", "csrc/cpu/point_drr.cpp")
+SOURCES = (
+    "csrc/ops.cpp",
+    "csrc/cpu/point_drr.cpp",
+    "csrc/cpu/voxel_project.cpp",
+    "csrc/cpu/voxel_backproject.cpp",
+    "csrc/cpu/voxel_backproject_weighted.cpp",
+)
 # setup.py reads these too. The target version lets one build serve torch 2.10 and every later release.
 DEFINES = ("-DTORCH_TARGET_VERSION=0x020a000000000000",)
 COMPILE_FLAGS = (

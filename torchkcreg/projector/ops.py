@@ -1,19 +1,17 @@
-"""The point-cloud DRR as a torch operator: fake kernels, autograd, and the choice of the backend.
+"""The point-cloud DRR as a torch operator: fake kernels and autograd.
 
-Schemas are in ``csrc/ops.cpp``, kernels in ``csrc/cpu``. They are loaded at first use, never at import.
+Schemas are in ``csrc/ops.cpp``, kernels in ``csrc/cpu``; see `backends` for when they are loaded.
 """
 
 from __future__ import annotations
 
-import functools
-
 import torch
 from torch import Tensor
 
-from . import extension
+from .backends import choose_backend, load_operators
 from .reference import splat_points
 
-BACKENDS = ("auto", "cpp", "torch")
+__all__ = ["choose_backend", "load_operators", "point_drr"]
 
 
 def point_drr(
@@ -38,34 +36,11 @@ def point_drr(
     return splat_points(points, masses, matrices, table, block_size, rows, cols)
 
 
-def choose_backend(points: Tensor, backend: str) -> str:
-    """The backend, "cpp" or "torch", that serves a request on the device of the points."""
-    if backend == "triton":
-        raise ValueError('backend "triton" is not available')
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
-    on_cpu = points.device.type == "cpu"
-    if backend == "cpp" and not on_cpu:
-        raise ValueError(f'backend "cpp" needs tensors on the CPU, got {points.device}')
-    if backend == "torch" or not on_cpu:
-        return "torch"
-    reason = load_operators()
-    if reason is None:
-        return "cpp"
-    if backend == "cpp":
-        raise OSError(f"the C++ kernels are not available: {reason}")
-    return "torch"
-
-
-@functools.lru_cache(maxsize=1)
-def load_operators() -> str | None:
-    """None once ``torch.ops.torchkcreg`` is ready, else why it can't be."""
-    reason = extension.unavailable_reason()
-    if reason is None:
-        torch.library.register_fake("torchkcreg::point_drr", _fake_forward)
-        torch.library.register_fake("torchkcreg::point_drr_backward", _fake_backward)
-        torch.library.register_autograd("torchkcreg::point_drr", _backward, setup_context=_setup_context)
-    return reason
+def register() -> None:
+    """Fake kernels and autograd of the compiled operator."""
+    torch.library.register_fake("torchkcreg::point_drr", _fake_forward)
+    torch.library.register_fake("torchkcreg::point_drr_backward", _fake_backward)
+    torch.library.register_autograd("torchkcreg::point_drr", _backward, setup_context=_setup_context)
 
 
 def _fake_forward(

@@ -15,7 +15,10 @@ class Stage(BaseModel):
     """One level of the coarse-to-fine schedule.
 
     Attributes:
-        groups: Number of control-point groups; one group is a rigid registration of the whole implant.
+        groups: Number of control-point groups; one group is a rigid registration of the whole implant. An implant that
+            spans fewer control points has as many groups as it can.
+        modes: The groups move along this many of the implant's softest elastic modes, rigid ones included; None: each
+            group has its own six degrees of freedom.
         bin: Detector pixels are averaged in squares of this side.
         oversampling: DRRs are rendered on pixels this many times finer and averaged as intensities: the mean of
             exponentials is not the exponential of the mean, and depth hangs on the difference.
@@ -26,14 +29,16 @@ class Stage(BaseModel):
         step_mm: Initial step: CMA-ES standard deviation, Adam learning rate, largest Gauss-Newton step.
         population: Candidates of a CMA-ES generation.
         margin_mm: What is seen around the implant's projection, mm at the detector; None: the whole detector.
-        background: Before the stage, what the model lacks (bone, water) is estimated as a smooth attenuation, and DRRs
+        background: Before the stage, what the model lacks (bone, water) is estimated as a smooth path length, and DRRs
             include it.
+        robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
         estimate: Parameters of the intensity model that are estimated along.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     groups: int = Field(1, ge=1, le=64)
+    modes: int | None = Field(None, ge=6)
     bin: int = Field(1, ge=1, le=64)
     oversampling: int = Field(2, ge=1, le=8)
     pitch_factor: int = Field(1, ge=1, le=16)
@@ -44,6 +49,7 @@ class Stage(BaseModel):
     population: int = Field(40, ge=4)
     margin_mm: float | None = Field(6.0, ge=0)
     background: bool = False
+    robust: bool = False
     estimate: tuple[NuisanceName, ...] = ()
 
 
@@ -52,17 +58,18 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
 
     All begin with a rigid CMA-ES on coarse pixels, which forgives a start that is off by several mm.
 
-    * "gauss-newton": then Gauss-Newton from one group to ten.
+    * "gauss-newton": then Gauss-Newton from one group to two, and on along elastic modes.
     * "paper": then CMA-ES with population 40, at most 400 iterations a stage, from 2 to 10 groups (Cao et al. 2020).
     * "adam": the groups and images of "gauss-newton", with Adam.
     """
     start = Stage(
-        bin=8,
-        pitch_factor=4,
+        bin=16,
+        pitch_factor=8,
+        oversampling=1,
         optimizer="cmaes",
         iterations=60,
         tolerance=0.1,
-        step_mm=2.0,
+        step_mm=4.0,
         population=16,
         margin_mm=25.0,
     )
@@ -71,8 +78,8 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         Stage(bin=4, pitch_factor=2),
         Stage(groups=2, bin=4, pitch_factor=2),
         Stage(groups=2, bin=2, pitch_factor=2, estimate=physics),
-        Stage(groups=5, bin=1, pitch_factor=2, estimate=physics, background=True),
-        Stage(groups=10, bin=1, pitch_factor=2, estimate=physics, background=True),
+        Stage(groups=20, modes=40, bin=2, pitch_factor=2, estimate=physics, background=True),
+        Stage(groups=20, modes=40, bin=1, pitch_factor=2, estimate=physics, background=True, robust=True),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
@@ -103,12 +110,17 @@ class RegistrationConfig(BaseModel):
         grid_shape: Control points along the principal axes, shortest axis first; grown where the implant needs more.
         grid_spacing_mm: Spacing of the control points, mm.
         beta: Weight of the diffusion penalty (eq. 5).
-        stiffness: Weight of the elastic energy of the implant's own material, as its mean density over Young's modulus.
-            That is half a squared strain: 30 charges 1e-5 of GC for strains of 1e-3, where steel yields, and 1e-3
-            for strains of 1e-2.
-        scatter: Initial scatter floor, as a fraction of the open beam.
+        stiffness: Weight of the elastic energy of the implant's own material in stages of groups, as its mean density
+            over Young's modulus. That is half a squared strain: 30 charges 1e-5 of GC for strains of 1e-3, where steel
+            yields, and 1e-3 for strains of 1e-2.
+        load_weight: Loss for a load of 1 kN along an elastic mode, in stages of modes; it grows with the load's square.
+        youngs_modulus_gpa: Young's modulus of the implant, GPa. The default is that of steel; only its square times
+            ``load_weight`` counts, and the order of magnitude of that.
+        scatter: Initial scatter, as a fraction of the measured signal about a pixel.
+        scatter_mm: How widely scatter is spread, standard deviation in mm at the detector.
         blur_px: Initial standard deviation of the detector's blur, pixels.
         background_mm: Smoothness of the estimated background, standard deviation in mm at the detector.
+        background_material: What the background is made of, as far as it hardens the beam.
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp", "triton" or "torch".
@@ -121,12 +133,16 @@ class RegistrationConfig(BaseModel):
     material: str | None = None
     pitch_mm: float = Field(0.25, gt=0)
     grid_shape: tuple[int, int, int] = (6, 6, 10)
-    grid_spacing_mm: tuple[float, float, float] = (8.75, 8.75, 25.0)
+    grid_spacing_mm: tuple[float, float, float] = (8.75, 8.75, 17.5)
     beta: float = Field(1e-4, ge=0)
     stiffness: float = Field(30.0, ge=0)
-    scatter: float = Field(0.05, ge=0, lt=1)
+    load_weight: float = Field(1e-9, ge=0)
+    youngs_modulus_gpa: float = Field(200.0, gt=0)
+    scatter: float = Field(0.08, ge=0, lt=1)
+    scatter_mm: float = Field(25.0, gt=0)
     blur_px: float = Field(0.7, ge=0)
     background_mm: float = Field(4.0, gt=0)
+    background_material: str = "cortical_bone"
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
     backend: Literal["auto", "cpp", "triton", "torch"] = "auto"

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate
 
 from torchkcreg.geometry import ConeBeamGeometry
+from torchkcreg.physics import gaussian_blur
+
+_SCATTER_BLOCK = 8  # scatter is smooth: its shape is found on blocks of this many pixels squared
 
 
 @dataclass(frozen=True)
@@ -18,8 +22,9 @@ class RegistrationData:
         geometry: V views.
         line_integrals: -ln(I / I0), shape (V, rows, cols).
         mask: True where a pixel counts, shape (V, rows, cols); all pixels when None was given.
-        background: Share of the beam that everything but the known components lets through, shape (V, rows, cols);
-            None where nothing is known of it.
+        background: Path length of what the known components lack (bone, water) through one material that stands for
+            it, shape (V, rows, cols), mm; None where nothing is known of it.
+        scatter_shape: How scatter is spread over the detector, shape (V, rows, cols); evenly if None.
 
     Raises:
         ValueError: If the views or the pixels of geometry and images differ, or no pixel is left.
@@ -29,6 +34,7 @@ class RegistrationData:
     line_integrals: Tensor
     mask: Tensor = None  # type: ignore[assignment]  # set below
     background: Tensor | None = None
+    scatter_shape: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.line_integrals.shape)
@@ -57,8 +63,8 @@ class RegistrationData:
 
     def select(self, views: list[int]) -> RegistrationData:
         """The given views alone, in the given order."""
-        background = None if self.background is None else self.background[views]
-        return RegistrationData(self.geometry.select(views), self.line_integrals[views], self.mask[views], background)
+        images = {name: image[views] for name, image in self._images().items()}
+        return replace(self, geometry=self.geometry.select(views), **images)
 
     def binned(self, factor: int) -> RegistrationData:
         """Data on pixels ``factor`` times as large: transmissions are averaged over the pixels that count.
@@ -70,13 +76,13 @@ class RegistrationData:
         rows, cols = (n // factor * factor for n in self.geometry.det_shape)
 
         def mean(image: Tensor) -> Tensor:
-            return torch.nn.functional.avg_pool2d(image[:, :rows, :cols], factor)
+            return avg_pool2d(image[:, :rows, :cols], factor)
 
         share = mean(self.mask.float())
         transmission = mean(torch.exp(-self.line_integrals) * self.mask) / share.clamp_min(1e-6)
         line_integrals = -torch.log(transmission.clamp_min(1e-6))
-        background = None if self.background is None else mean(self.background)
-        return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5, background)
+        estimates = {name: mean(image) for name, image in self._estimates().items()}
+        return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5, **estimates)
 
     def windowed(self, points: Tensor, margin_px: float) -> RegistrationData:
         """Data cropped, view by view, to the projection of ``points`` and a margin.
@@ -101,16 +107,12 @@ class RegistrationData:
         low = torch.minimum(torch.maximum(low, torch.zeros_like(low)), limit).long()
         high = torch.maximum(torch.minimum(high, limit), low.to(high)).long()
         size_u, size_v = (high - low + 1).amax(dim=0).tolist()
+        windows = {name: image.new_zeros(self.num_views, size_v, size_u) for name, image in self._images().items()}
         matrices = self.geometry.projection_matrices.clone()
-        images = self.line_integrals.new_zeros((self.num_views, size_v, size_u))
-        mask = torch.zeros_like(images, dtype=torch.bool)
-        background = None if self.background is None else torch.ones_like(images)
         for view, (u0, v0) in enumerate(low.tolist()):
             height, width = min(size_v, rows - v0), min(size_u, cols - u0)
-            images[view, :height, :width] = self.line_integrals[view, v0 : v0 + height, u0 : u0 + width]
-            mask[view, :height, :width] = self.mask[view, v0 : v0 + height, u0 : u0 + width]
-            if background is not None and self.background is not None:
-                background[view, :height, :width] = self.background[view, v0 : v0 + height, u0 : u0 + width]
+            for name, image in self._images().items():
+                windows[name][view, :height, :width] = image[view, v0 : v0 + height, u0 : u0 + width]
             matrices[view, 0] -= u0 * matrices[view, 2]
             matrices[view, 1] -= v0 * matrices[view, 2]
         geometry = ConeBeamGeometry(
@@ -120,4 +122,30 @@ class RegistrationData:
             sources=self.geometry.sources,
             angles_deg=self.geometry.angles_deg,
         )
-        return RegistrationData(geometry, images, mask, background)
+        return RegistrationData(geometry, **windows)
+
+    def with_scatter_shape(self, sigma_mm: float) -> RegistrationData:
+        """The data with a shape of the scatter: the measured transmission, blurred by ``sigma_mm`` at the detector.
+
+        Scatter comes from where the primary beam comes through, and is spread widely (Sun & Star-Lack 2010).
+        """
+        factor = min(_SCATTER_BLOCK, *self.geometry.det_shape)
+        sigma = sigma_mm / self.geometry.pixel_spacing[1] / factor
+        transmission = adaptive_avg_pool2d(torch.exp(-self.line_integrals) * self.mask, self._blocks(factor))
+        share = adaptive_avg_pool2d(self.mask.float(), self._blocks(factor))
+        smooth = gaussian_blur(transmission, sigma) / gaussian_blur(share, sigma).clamp_min(1e-3)
+        size = tuple(self.geometry.det_shape)
+        return replace(
+            self, scatter_shape=interpolate(smooth[None], size=size, mode="bilinear", align_corners=False)[0]
+        )
+
+    def _blocks(self, factor: int) -> tuple[int, int]:
+        rows, cols = self.geometry.det_shape
+        return max(1, rows // factor), max(1, cols // factor)
+
+    def _estimates(self) -> dict[str, Tensor]:
+        estimates = {"background": self.background, "scatter_shape": self.scatter_shape}
+        return {name: image for name, image in estimates.items() if image is not None}
+
+    def _images(self) -> dict[str, Tensor]:
+        return {"line_integrals": self.line_integrals, "mask": self.mask, **self._estimates()}

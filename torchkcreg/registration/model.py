@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from torchkcreg.deformation import cluster_control_points, control_point_masses, group_centers, group_moments
 from torchkcreg.geometry import fit_rigid, transform_points
@@ -14,9 +15,12 @@ from torchkcreg.projector import cell_footprint, project_points
 
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
+from .elasticity import Elasticity, ModalMotion
 from .motion import GroupMotion
 from .nuisance import Nuisance
 from .scene import Scene
+
+_SOLID_PITCH_FACTOR = 8  # bending is smooth: its energy needs few nodes
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,9 @@ class _Displaced:
 class StageModel:
     """DRRs of whole batches of candidates at a stage's image scale.
 
-    Parameters are increments in mm to the scene's state when the model is made: six a group, then the estimated
-    parameters of the intensity model. Node weights are computed here, once: the displacement of a node is linear in
-    the groups' motions, ``u = sum_g W_g t_g + (R_g - I) M_g``.
+    Parameters are increments in mm to the scene's state when the model is made: six a group or one an elastic mode,
+    then the estimated parameters of the intensity model. Node weights are computed here, once: the displacement of a
+    node is linear in the groups' motions, ``u = sum_g W_g t_g + (R_g - I) M_g``.
 
     Args:
         scene: Implant, components and intensity model in their present state.
@@ -75,13 +79,20 @@ class StageModel:
         coarse = self.scene.implant.coarsened(4)
         self.weights = control_point_masses(grid, coarse.points, coarse.masses)
         self.labels = cluster_control_points(grid, self.weights, self.stage.groups)
-        self.motion = GroupMotion(
+        so_far = self.scene.deformation.control_points.detach().double().reshape(-1, 3)
+        groups = GroupMotion(
             grid.positions().double().reshape(-1, 3),
-            self.scene.deformation.control_points.detach().double().reshape(-1, 3),
+            so_far if self.stage.modes is None else torch.zeros_like(so_far),
             self.labels.flatten(),
             self.weights.flatten(),
             group_centers(grid, self.labels),
         )
+        solid = self.implant.coarsened(max(1, _SOLID_PITCH_FACTOR // self.stage.pitch_factor))
+        self.elasticity = Elasticity(grid, self.labels, solid)
+        self.motion: GroupMotion | ModalMotion = groups
+        if self.stage.modes is not None:
+            moved = self.scene.deformation.displacement(solid.points.double()) @ grid.frame[:3, :3].double()
+            self.motion = ModalMotion(groups, self.elasticity, self.stage.modes, moved)
         self.grid_to_world = self.scene.implant_to_world @ grid.frame.to(self.scene.implant_to_world)
         self.nodes = self._displaced(self.implant.points, torch.float32)
         self.followed = [self._displaced(points, torch.float64) for points in self.scene.followed]
@@ -110,6 +121,7 @@ class StageModel:
             self.data = self.data.windowed(torch.cat([points[0] for points in at_start]), margin_px)
         fine = self.data.geometry.refined(stage.oversampling)
         self.matrices, self.det_shape = fine.projection_matrices.float(), fine.det_shape
+        self.background = _resized(self.data.background, fine.det_shape)
         cell = self.implant.cell.float() @ self.scene.implant_to_world[:3, :3].float().T
         self.footprints = [cell_footprint(points[0], cell, self.matrices) for points in at_start]
 
@@ -129,9 +141,7 @@ class StageModel:
 
     def motion_steps(self, parameters: Tensor) -> Tensor:
         """Motions (K, 4 G, 3) of the groups in the grid's axes, as the moments multiply them: t_g, then R_g - I."""
-        rotations, translations = self.motion(self.split(parameters)[0])
-        turns = (rotations - torch.eye(3).to(rotations)).mT
-        return torch.cat([translations[..., None, :], turns], dim=-2).flatten(1, 2)
+        return self.motion.steps(self.split(parameters)[0])
 
     def world_points(self, parameters: Tensor) -> list[Tensor]:
         """World positions (K, N_m, 3) of the nodes of each material."""
@@ -148,7 +158,10 @@ class StageModel:
         return clouds
 
     def path_lengths(self, parameters: Tensor) -> Tensor:
-        """Path lengths (K, M, V, rows, cols) of candidates (K, D) on the oversampled pixels, mm."""
+        """Path lengths (K, M, V, rows, cols) of candidates (K, D) on the oversampled pixels, mm.
+
+        Where the intensity model knows one, the last of the materials is the background.
+        """
         paths = [
             project_points(
                 points, cloud.masses, self.matrices, self.det_shape, footprint=footprint, backend=self.config.backend
@@ -157,14 +170,24 @@ class StageModel:
                 self.world_points(parameters), self.clouds, self.footprints, strict=True
             )
         ]
+        if self.scene.is_polyenergetic:
+            unknown = torch.zeros(()) if self.background is None else self.background
+            paths.append(unknown.expand_as(paths[0]))
         return torch.stack(paths, dim=-4)
 
     def line_integrals(self, parameters: Tensor) -> Tensor:
         """DRRs (K, V, rows, cols) of candidates (K, D)."""
         physics = self.nuisance(self.split(parameters)[1])
-        if self.data.background is not None:
-            physics["background"] = self.data.background
+        if self.data.scatter_shape is not None and self.scene.is_polyenergetic:
+            physics["scatter_shape"] = self.data.scatter_shape
         return self.scene.intensity(self.path_lengths(parameters), pooling=self.stage.oversampling, **physics)
+
+
+def _resized(images: Tensor | None, size: tuple[int, int]) -> Tensor | None:
+    """Smooth images (V, rows, cols) on other pixels of the same detector."""
+    if images is None:
+        return None
+    return interpolate(images[None], size=tuple(size), mode="bilinear", align_corners=False)[0]
 
 
 def _coarsened(cloud: ImplantPointCloud, factor: int) -> ImplantPointCloud:

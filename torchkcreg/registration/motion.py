@@ -59,3 +59,13 @@ class GroupMotion:
         start = centers + self.translations.to(steps) - pivots
         moved = (turn @ start[..., None])[..., 0] + pivots + steps[..., 3:]
         return rotations, moved - centers
+
+    def steps(self, parameters: Tensor) -> Tensor:
+        """Motions (K, 4 G, 3) of the groups as the nodes' moments multiply them: t_g, then R_g - I.
+
+        Args:
+            parameters: Shape (K, 6 G), mm.
+        """
+        rotations, translations = self(parameters)
+        turns = (rotations - torch.eye(3).to(rotations)).mT
+        return torch.cat([translations[..., None, :], turns], dim=-2).flatten(1, 2)

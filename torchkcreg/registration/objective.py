@@ -1,25 +1,21 @@
-"""The objective of a stage: -GC + beta R and the implant's elastic energy (section 2.3 of the paper)."""
+"""The objective of a stage: -GC + beta R (section 2.3 of the paper), and what is known of the implant's elasticity."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import (
-    control_points_from_groups,
-    diffusion_penalty,
-    group_moment_gradients,
-    strain_energy,
-)
-from torchkcreg.similarity import GradientCorrelation
+from torchkcreg.deformation import control_points_from_groups, diffusion_penalty
+from torchkcreg.similarity import GradientCorrelation, sobel_gradient
 
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
+from .elasticity import ModalMotion
 from .model import StageModel
+from .robust import residual_weights
 from .scene import Scene
 
 _NODES_AT_ONCE = 5_000_000  # of all candidates that are rendered together: 60 MB of positions
-_STRAIN_PITCH_FACTOR = 8  # bending is smooth: the energy needs few nodes
 
 
 class StageObjective:
@@ -37,26 +33,36 @@ class StageObjective:
         self.model = StageModel(scene, data, stage, config)
         self.num_parameters = self.model.num_parameters
         self.similarity = GradientCorrelation(self.model.data.line_integrals, self.model.data.mask)
-        solid = self.model.implant.coarsened(max(1, _STRAIN_PITCH_FACTOR // stage.pitch_factor))
-        self.volumes = solid.masses
-        grid = scene.deformation.grid
-        self.slopes = group_moment_gradients(grid, self.model.labels, solid.points.double()).flatten(-2)
+        if stage.robust:
+            self._reweight()
 
     def control_points(self, parameters: Tensor) -> Tensor:
         """Control-point displacements (K, nx, ny, nz, 3) of candidates."""
         rotations, translations = self.model.motion(self.model.split(parameters)[0])
         return control_points_from_groups(self.scene.deformation.grid, self.model.labels, rotations, translations)
 
-    def deformation_gradients(self, parameters: Tensor) -> Tensor:
-        """Deformation gradients (K, n, 3, 3) at some of the implant's nodes, in the grid's axes."""
-        steps = self.model.motion_steps(parameters)
-        return torch.eye(3).to(steps) + (self.slopes @ steps[:, None]).mT
-
     def penalty(self, parameters: Tensor) -> Tensor:
-        """beta R (eq. 5) and the implant's elastic energy, weighted, of candidates, shape (K,)."""
+        """What speaks against candidates but the images, shape (K,).
+
+        Groups: beta R (eq. 5) and the weighted elastic energy. Modes: the weighted sum of squared loads that hold the
+        implant in its shape. Loads do not charge a bend for being strong, as the energy does, but for needing forces
+        in many places: between the screws that load it a plate is free.
+        """
+        motion = self.model.motion
+        if isinstance(motion, ModalMotion):
+            loads = self.config.youngs_modulus_gpa * motion.loads(self.model.split(parameters)[0])
+            return self.config.load_weight * loads.square().sum(-1)
         diffusion = diffusion_penalty(self.control_points(parameters), self.scene.deformation.grid)
-        elastic = strain_energy(self.deformation_gradients(parameters), self.volumes)
+        elastic = self.model.elasticity.energy(self.model.motion_steps(parameters))
         return self.config.beta * diffusion + self.config.stiffness * elastic
+
+    @torch.no_grad()
+    def _reweight(self) -> None:
+        model = self.model
+        images = model.line_integrals(model.at_rest)
+        residuals = self.similarity.residuals(images)[0]
+        weights = residual_weights(residuals, sobel_gradient(images)[0], model.data.mask)
+        self.similarity = GradientCorrelation(model.data.line_integrals, model.data.mask, weights)
 
     def project(self, parameters: Tensor) -> Tensor:
         """Candidates with the intensity model's parameters inside their bounds."""
@@ -69,7 +75,7 @@ class StageObjective:
 
     @torch.no_grad()
     def losses(self, candidates: Tensor) -> Tensor:
-        """1 - GC + beta R of candidates (K, D), shape (K,)."""
+        """1 - GC and the penalties of candidates (K, D), shape (K,)."""
         return torch.cat([self._losses(c) for c in candidates.split(self._batch())])
 
     def _losses(self, candidates: Tensor) -> Tensor:

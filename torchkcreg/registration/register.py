@@ -43,7 +43,7 @@ def build_scene(
     intensity: nn.Module = IdentityIntensity()
     if config.material is not None:
         intensity = PolyenergeticTransmission(
-            [material(n) for n in names],
+            [material(n) for n in [*names, config.background_material]],
             spectrum or tungsten_spectrum(),
             scatter=config.scatter,
             blur_sigma_px=config.blur_px,

@@ -56,6 +56,11 @@ class Scene(nn.Module):
         return list(dict.fromkeys([self.material, *(c.material for c in self.components)]))
 
     @property
+    def is_polyenergetic(self) -> bool:
+        """Whether the intensity model has materials; it then has the background as its last one."""
+        return hasattr(self.intensity, "scatter")
+
+    @property
     def num_groups(self) -> int:
         """Groups of control points that the deformation has been split into so far."""
         return int(self.deformation.labels.max()) + 1

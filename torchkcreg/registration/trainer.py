@@ -23,7 +23,9 @@ from .scene import Scene
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
     """The objective of a stage at the scene's present state, with the background that the stage asks for."""
-    if stage.background and hasattr(scene.intensity, "scatter"):
+    if scene.is_polyenergetic and data.scatter_shape is None:
+        data = data.with_scatter_shape(config.scatter_mm)
+    if stage.background and scene.is_polyenergetic:
         data = replace(data, background=estimate_background(scene, data, config))
     return StageObjective(scene, data, stage, config)
 

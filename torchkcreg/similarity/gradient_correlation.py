@@ -75,7 +75,7 @@ class GradientCorrelation(nn.Module):
     mask: Tensor | None
     eroded_mask: Tensor | None
 
-    def __init__(self, fixed: Tensor, mask: Tensor | None = None) -> None:
+    def __init__(self, fixed: Tensor, mask: Tensor | None = None, weights: Tensor | None = None) -> None:
         super().__init__()
         if fixed.ndim != 3:
             raise ValueError(f"fixed must have shape (V, rows, cols), got {tuple(fixed.shape)}")
@@ -86,6 +86,8 @@ class GradientCorrelation(nn.Module):
         if not counted.all():
             raise ValueError(f"fixed must be finite where it counts, got {int((~counted).sum())} pixels that are not")
         eroded = None if mask is None else erode_mask(mask)
+        if weights is not None:
+            eroded = weights if eroded is None else eroded * weights
         self.register_buffer("mask", mask)
         self.register_buffer("eroded_mask", eroded)
         self.register_buffer("unit_gradients", _unit_gradients(fixed.detach(), mask, eroded))

@@ -37,6 +37,7 @@ def normalized_cross_correlation(a: Tensor, b: Tensor, *, mask: Tensor | None = 
     if mask is not None:
         _check_same_size(a, mask, "mask")
         a, b = (torch.where(mask != 0, image, 0.0) for image in (a, b))
+    mask = None if mask is None else mask != 0
     unit_a, unit_b = (unit_contrast(image, mask, largest_value(image)) for image in (a, b))
     return (unit_a * unit_b).sum((-2, -1))
 
@@ -57,10 +58,10 @@ def unit_contrast(images: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
         count = torch.tensor(float(images.shape[-2] * images.shape[-1]), dtype=images.dtype, device=images.device)
         contrast = images - images.mean((-2, -1), keepdim=True)
     else:
-        weight = (mask != 0).to(images.dtype)
+        weight = mask.to(images.dtype)
         count = weight.sum((-2, -1))
-        mean = (images * weight).sum((-2, -1)) / count.clamp(min=1.0)
-        contrast = (images - mean[..., None, None]) * weight
+        mean = (images * weight).sum((-2, -1)) / count.clamp(min=torch.finfo(images.dtype).tiny)
+        contrast = (images - mean[..., None, None]) * weight.sqrt()
     power = contrast.square().sum((-2, -1))
     floor = count * (_FLAT_ROUNDINGS * torch.finfo(images.dtype).eps * scale.detach()).square()
     sharp = power > floor.clamp(min=torch.finfo(images.dtype).tiny)

@@ -1,10 +1,21 @@
-"""Figures of a registration: overlays on the projections, displacement maps, the course of the optimisation.
+"""Figures of a registration: overlays, displacement and error maps, histograms, the course of the optimisation.
 
 Each function returns a matplotlib `Figure` of its own; nothing touches pyplot's state or a screen.
 """
 
+from .capture import capture_figure
 from .displacement import displacement_figure
+from .errors import error_map_figure, histogram_figure
 from .history import history_figure
 from .overlay import overlay_figure
+from .reconstruction import reconstruction_figure
 
-__all__ = ["displacement_figure", "history_figure", "overlay_figure"]
+__all__ = [
+    "capture_figure",
+    "displacement_figure",
+    "error_map_figure",
+    "histogram_figure",
+    "history_figure",
+    "overlay_figure",
+    "reconstruction_figure",
+]

@@ -1,0 +1,140 @@
+import json
+
+import pytest
+import torch
+
+from torchkcreg.cli import main
+from torchkcreg.experiments import (
+    ReconstructionFiles,
+    ReconstructionOptions,
+    RegistrationFiles,
+    reconstruct_files,
+    register_files,
+    registered_components,
+)
+from torchkcreg.experiments.reconstruct_files import resolve_options
+from torchkcreg.geometry import circular_geometry
+from torchkcreg.io import RunFolder, read_volume, write_geometry, write_projections
+from torchkcreg.simulation.solids import Sphere
+
+
+@pytest.fixture(scope="module")
+def ball_scan(tmp_path_factory, ball_images):
+    """Folder with the scan of a ball of water, 20 mm in radius, in air."""
+    folder = tmp_path_factory.mktemp("ball")
+    geometry, images = ball_images
+    write_geometry(folder / "geometry.json", geometry)
+    write_projections(folder / "projections.npz", intensity=1000 * torch.exp(-images), open_beam=1000.0)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ball_images():
+    from torchkcreg.simulation.chords import chord_image
+
+    geometry = circular_geometry(range(0, 200, 5), sad=404, sdd=538, det_shape=(28, 40), pixel_spacing=(2.5, 2.5))
+    ball = Sphere(torch.zeros(3), 20.0)
+    return geometry, torch.stack(
+        [0.02 * chord_image(ball, matrix, geometry.det_shape) for matrix in geometry.projection_matrices]
+    )
+
+
+@pytest.fixture(scope="module")
+def small_run(small_case, tmp_path_factory):
+    """A finished registration of the small case."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    files = RegistrationFiles(
+        implant=small_case / "implant.stl",
+        geometry=small_case / "geometry.json",
+        projections=small_case / "projections.npz",
+        components=small_case / "screws.json",
+        spectrum=small_case / "spectrum.csv",
+        config=small_case / "quick.yaml",
+    )
+    register_files(files, out, overrides={"material": "steel"}, figures=False)
+    return out
+
+
+def arguments(folder, out, *more):
+    files = ["--geometry", str(folder / "geometry.json"), "--projections", str(folder / "projections.npz")]
+    return ["reconstruct", *files, "--out", str(out), "--spacing", "4", *map(str, more)]
+
+
+@pytest.mark.parametrize("method", ["fdk", "pwls"])
+def test_the_command_line_makes_a_volume_with_its_geometry(ball_scan, tmp_path, method):
+    assert main(arguments(ball_scan, tmp_path / "out", "--method", method, "--iterations", 6, "--beta", 1)) == 0
+    volume, grid = read_volume(tmp_path / "out" / "volume.mha")
+    inside = grid.points().norm(dim=-1) < 14
+    assert volume[inside].mean() == pytest.approx(0.02, rel=0.03)
+    numbers, _ = read_volume(tmp_path / "out" / "volume_hu.mha")
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    expected = 1000 * (volume[inside].mean() / metrics["water"] - 1)
+    assert numbers[inside].mean() == pytest.approx(float(expected), abs=1)
+    assert (tmp_path / "out" / "slices.png").stat().st_size > 1000
+    assert metrics["scatter"]["fraction"] < 0.02
+
+
+def test_size_and_centre_choose_the_voxels(ball_scan, tmp_path):
+    flags = ("--size", 24, 24, 12, "--center", 4, 0, 2, "--no-figures")
+    assert main(arguments(ball_scan, tmp_path / "out", *flags)) == 0
+    _, grid = read_volume(tmp_path / "out" / "volume.mha")
+    assert grid.shape == (3, 6, 6)
+    assert grid.origin == pytest.approx((-6.0, -10.0, -2.0))
+
+
+def test_kcrec_takes_implant_and_files_from_the_run(small_run, tmp_path):
+    options = ["--method", "kcrec", "--run", str(small_run), "--out", str(tmp_path / "out"), "--spacing", "6"]
+    assert main(["reconstruct", *options, "--size", "60", "60", "120", "--iterations", "2", "--subsets", "1"]) == 0
+    background, _ = read_volume(tmp_path / "out" / "volume.mha")
+    whole, _ = read_volume(tmp_path / "out" / "with_implant.mha")
+    assert whole.max() > 5 * background.max().clamp_min(0.01)
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["components"].count("steel") > 1
+
+
+def test_the_registered_metal_has_the_volume_of_its_meshes(small_run, small_case):
+    components = registered_components(small_run)
+    assert len(components) == 7  # a plate and six screws
+    from torchkcreg.io import read_mesh
+
+    assert components[0].cloud.volume == pytest.approx(read_mesh(small_case / "implant.stl").volume, rel=0.01)
+    plate_alone = registered_components(small_run, components=small_case / "screws.json")
+    assert len(plate_alone) == 7
+
+
+def test_a_stopped_reconstruction_resumes_to_the_same_volume(ball_scan, tmp_path, monkeypatch):
+    files = ReconstructionFiles(geometry=ball_scan / "geometry.json", projections=ball_scan / "projections.npz")
+    options = ReconstructionOptions(method="pwls", spacing_mm=5.0, iterations=12, subsets=4, scatter="none")
+    reconstruct_files(files, tmp_path / "whole", options, figures=False)
+
+    save, calls = RunFolder.save_checkpoint, []
+
+    def stop_at_the_second(run, state):
+        save(run, state)
+        calls.append(state["solver"]["iteration"])
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "save_checkpoint", stop_at_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct_files(files, tmp_path / "cut", options, figures=False)
+    assert calls == [5, 10] and not (tmp_path / "cut" / "volume.mha").exists()
+    reconstruct_files(files, tmp_path / "cut", options, resume=True, figures=False)
+    whole, cut = (read_volume(tmp_path / name / "volume.mha")[0] for name in ("whole", "cut"))
+    assert torch.equal(whole, cut)
+    with pytest.raises(ValueError, match="started with other reconstruction"):
+        changed = options.model_copy(update={"beta": 3.0})
+        reconstruct_files(files, tmp_path / "cut", changed, resume=True, figures=False)
+
+
+def test_wrong_input_is_one_line_that_names_it(ball_scan, small_run, tmp_path, capsys):
+    assert main(arguments(ball_scan, tmp_path / "a", "--method", "kcrec")) == 2
+    assert "needs the run of a registration" in capsys.readouterr().err
+    assert main(["reconstruct", "--run", str(small_run), "--out", str(tmp_path / "b"), "--scatter", "none"]) == 2
+    assert "needs at least 3 views" in capsys.readouterr().err or not (tmp_path / "b" / "volume.mha").exists()
+    assert main(arguments(ball_scan, tmp_path / "c", "--size", 10, -1, 10)) == 2
+    assert "size_mm must be positive" in capsys.readouterr().err
+    assert main(["reconstruct", "--out", str(tmp_path / "d")]) == 2
+    assert "needs geometry and projections" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="unknown_key: Extra inputs"):
+        resolve_options({"unknown_key": 1})

@@ -1,0 +1,84 @@
+"""Elastic modes: rigid ones first, then bends as a beam has them; loads; where a stage of modes starts."""
+
+import math
+
+import pytest
+import torch
+from small_scene import bend, image, pose, scene
+
+from torchkcreg.geometry import transform_points
+from torchkcreg.registration import RegistrationConfig, Scene, Stage
+from torchkcreg.registration.elasticity import ModalMotion
+from torchkcreg.registration.model import StageModel
+from torchkcreg.registration.objective import StageObjective
+
+GRID = {"grid_shape": (4, 4, 8), "grid_spacing_mm": (8.0, 8.0, 8.0)}
+CONFIG = RegistrationConfig(stages=(Stage(groups=8, modes=14, oversampling=1),), **GRID)
+
+
+def modal(of, config=CONFIG) -> tuple[StageModel, ModalMotion]:
+    model = StageModel(of, image(of, config), config.schedule()[0], config)
+    assert isinstance(model.motion, ModalMotion)
+    return model, model.motion
+
+
+def test_the_softest_six_modes_are_rigid_and_the_others_stiffer_and_stiffer() -> None:
+    _, motion = modal(scene(CONFIG))
+    rigid, elastic = motion.stiffnesses[:6], motion.stiffnesses[6:]
+    assert float(rigid.max()) < 1e-6 * float(elastic[0])
+    assert (elastic.diff() >= 0).all()
+
+
+def test_a_mode_moves_the_implant_by_a_root_mean_square_of_one_millimetre() -> None:
+    model, motion = modal(scene(CONFIG))
+    small = 1e-3 * torch.eye(motion.num_parameters, dtype=torch.float64)
+    displacements = model.elasticity.displacements(motion.steps(small))
+    torch.testing.assert_close(displacements @ displacements.T, 1e-6 * torch.eye(14).double(), atol=2e-8, rtol=0)
+
+
+def test_the_energy_of_a_mode_is_half_its_stiffness() -> None:
+    model, motion = modal(scene(CONFIG))
+    for mode in (6, 9):
+        step = torch.zeros(1, 14, dtype=torch.float64)
+        step[0, mode] = 0.01
+        energy = model.elasticity.volume * model.elasticity.energy(motion.steps(step))
+        assert float(energy.detach()) == pytest.approx(0.5 * float(motion.stiffnesses[mode]) * 1e-4, rel=0.02)
+
+
+def test_the_first_bend_is_as_stiff_as_a_free_beam_of_blended_sections() -> None:
+    # Euler-Bernoulli: k = (4.730 / L)^4 I L for a mode of unit root mean square. Blended rigid groups are stiffer, and
+    # the few nodes of the energy's integral have a little less second moment than the solid.
+    model, motion = modal(scene(CONFIG))
+    size = (model.implant.points.amax(0) - model.implant.points.amin(0)).double() + CONFIG.pitch_mm
+    thickness, width, length = size.sort().values.tolist()
+    beam = (4.730 / length) ** 4 * width * thickness**3 / 12 * length
+    assert 0.6 * beam < float(motion.stiffnesses[6]) < 3 * beam
+
+
+def test_a_stage_of_modes_starts_from_the_bend_so_far() -> None:
+    every = CONFIG.model_copy(update={"stages": (CONFIG.stages[0].model_copy(update={"modes": 48}),)})
+    here = scene(every, pose(1.0, 0.5))
+    bend(here, math.radians(1.0))
+    bending = here.deformation.displacement(here.implant.points.double()).detach()
+    before = in_world(here)
+    objective = StageObjective(here, image(here, every), every.schedule()[0], every)
+    objective.accept(objective.model.at_rest[0])
+    error = (in_world(here) - before).norm(dim=-1)
+    assert float(bending.norm(dim=-1).max()) > 0.1
+    assert float(error.max()) < 0.02 * float(bending.norm(dim=-1).max())
+
+
+def in_world(of: Scene) -> torch.Tensor:
+    """Where the implant's nodes are."""
+    points = of.implant.points.double()
+    return transform_points(of.implant_to_world, points + of.deformation.displacement(points)).detach()
+
+
+def test_a_straight_implant_needs_no_load_and_a_bent_one_does() -> None:
+    _, straight = modal(scene(CONFIG))
+    assert float(straight.loads(torch.zeros(14).double()).abs().max()) < 1e-9
+    bent = scene(CONFIG)
+    bend(bent, math.radians(1.0))
+    _, motion = modal(bent)
+    loads = motion.loads(torch.zeros(14).double())
+    assert float(loads[6:].abs().max()) > 1e3 * float(loads[:6].abs().max())

@@ -1,0 +1,168 @@
+"""Rigid alignment of one shape with another: coherent point drift, and a refinement that uses all of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+from pycpd import RigidRegistration
+from torch import Tensor
+
+from torchkcreg.geometry import rigid_matrix, transform_points
+
+from .distances import closest_on_surface, finite_cloud
+
+_CPD_POINTS = 700  # its time and memory grow with their square
+_CPD_ITERATIONS = 60
+_POINTS_PER_BLOCK = 60
+_SURFACE_POINTS = 4000
+_SETTLED_MM = 1e-4
+
+
+def rigid_coherent_point_drift(
+    moving: Tensor, fixed: Tensor, *, num_points: int = _CPD_POINTS, iterations: int = _CPD_ITERATIONS
+) -> Tensor:
+    """The rigid motion (4, 4) that drifts one point cloud onto another (Myronenko & Song 2010), by the library pycpd.
+
+    Correspondences are soft, so that it comes home from far off; the scale is fixed at one, since neither the implant
+    nor its reference grows. What it costs grows with N M, so both clouds
+    are thinned, and that limits it to some tenths of a mm for an implant; `align_to_surface` goes on from there.
+
+    Args:
+        moving: (N, 3) in mm.
+        fixed: (M, 3) in mm.
+        num_points: about how many points of each take part, merged on a lattice; a smaller cloud takes part whole.
+        iterations: at most.
+
+    Raises:
+        ValueError: a cloud is empty, of another shape, or not finite.
+
+    >>> corner = torch.tensor([[0.0, 0, 0], [9, 0, 0], [0, 5, 0], [0, 0, 2]])
+    >>> motion = rigid_coherent_point_drift(corner + torch.tensor([0.5, -1, 0]), corner)
+    >>> [round(x, 3) + 0.0 for x in motion[:3, 3].tolist()]
+    [-0.5, 1.0, 0.0]
+    """
+    moving, fixed = finite_cloud(moving, "moving"), finite_cloud(fixed, "fixed")
+    center = fixed.mean(0)  # about the middle, where rotation and translation depend least on each other
+    drift = _Rigid(
+        X=(merged(fixed, num_points) - center).numpy(),
+        Y=(merged(moving, num_points) - center).numpy(),
+        max_iterations=iterations,
+    )
+    drift.register()
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = torch.from_numpy(np.asarray(drift.R).T.copy())  # pycpd multiplies rows from the right
+    motion[:3, 3] = torch.from_numpy(np.asarray(drift.t).ravel()) + center - motion[:3, :3] @ center
+    return motion
+
+
+class _Rigid(RigidRegistration):
+    """pycpd's rigid registration estimates a scale too; this one keeps it at one."""
+
+    q: float
+    sigma2: float
+
+    def update_transform(self) -> None:
+        super().update_transform()
+        self.s = 1.0
+        self.t = (self.Pt1 @ self.X - self.P1 @ self.Y @ self.R)[None] / self.Np
+
+    def update_variance(self) -> None:
+        """The variance for the scale one (fig. 2 of Myronenko & Song 2010 assumes the best scale)."""
+        before, fit = self.q, float(np.trace(self.A @ self.R))
+        residual = float(self.Pt1 @ np.sum(self.X_hat**2, axis=1)) - 2 * fit + float(self.YPY)
+        self.q = residual / (2 * self.sigma2) + self.D * self.Np / 2 * np.log(self.sigma2)
+        self.diff = abs(self.q - before)
+        self.sigma2 = max(residual / (self.Np * self.D), self.tolerance / 10)
+
+
+def align_to_surface(
+    points: Tensor,
+    mesh: trimesh.Trimesh,
+    *,
+    inset: bool = False,
+    iterations: int = 30,
+    num_points: int = _SURFACE_POINTS,
+) -> Tensor:
+    """The rigid motion (4, 4) that lays points (N, 3) on a surface: least squares of their distances from it.
+
+    Each iteration takes the nearest points of the surface as planes (Chen & Medioni 1992), so that flat faces slide
+    freely along each other; nodes or points drawn to points would stick. It needs a start that is right within a few
+    mm, such as coherent point drift gives.
+
+    Args:
+        points: on or near the surface, mm.
+        mesh: the surface.
+        inset: the points lie inside by the same depth everywhere, which is estimated along: outermost nodes of voxels.
+        iterations: at most.
+        num_points: about how many of the points take part.
+
+    Raises:
+        ValueError: the cloud is empty, of another shape or not finite, or the mesh has no faces.
+    """
+    points = thinned(finite_cloud(points, "points"), num_points)
+    center = points.mean(0)
+    motion = torch.eye(4, dtype=torch.float64)
+    for _ in range(iterations):
+        moved = transform_points(motion, points)
+        closest, _, normals = closest_on_surface(moved, mesh)
+        heights = ((moved - closest) * normals).sum(-1)
+        middle = transform_points(motion, center[None])[0]
+        arms = torch.linalg.cross(moved - middle, normals)
+        columns = [arms, normals, torch.ones_like(heights)[:, None]] if inset else [arms, normals]
+        solution = torch.linalg.lstsq(torch.cat(columns, dim=-1), -heights[:, None], driver="gelsd").solution[:, 0]
+        step = rigid_matrix(solution[:3], solution[3:6])
+        step[:3, 3] += middle - step[:3, :3] @ middle
+        motion = step @ motion
+        if float((transform_points(motion, points) - moved).norm(dim=-1).max()) < _SETTLED_MM:
+            break
+    return motion
+
+
+def thinned(points: Tensor, num_points: int) -> Tensor:
+    """At most ``num_points`` of the points (N, 3): a random choice, the same each time."""
+    if len(points) <= num_points:
+        return points
+    chosen = np.random.default_rng(0).permutation(len(points))[:num_points]
+    return points[torch.from_numpy(np.sort(chosen))]
+
+
+def merged(points: Tensor, num_points: int) -> Tensor:
+    """Centroids of the points (N, 3) in blocks of a lattice, about ``num_points``; all points if fewer.
+
+    For soft correspondences this is much better than a random choice: what represents a block stands in its middle.
+    """
+    if len(points) <= num_points:
+        return points
+    points = thinned(points, _POINTS_PER_BLOCK * num_points)
+    low, size = points.amin(0), points.amax(0) - points.amin(0)
+    edge = float(size.max()) / 4
+    while True:
+        cells = ((points - low) / edge).floor().long()
+        _, rows, layers = (cells.amax(0) + 1).tolist()
+        blocks, block = torch.unique((cells[:, 0] * rows + cells[:, 1]) * layers + cells[:, 2], return_inverse=True)
+        if len(blocks) >= num_points:
+            break
+        edge *= 0.93
+    sums = points.new_zeros(len(blocks), 3).index_add_(0, block, points)
+    return sums / torch.bincount(block, minlength=len(blocks))[:, None]
+
+
+def principal_motions(moving: Tensor, fixed: Tensor) -> list[Tensor]:
+    """The four rigid motions (4, 4) that lay centre and principal axes of one cloud (N, 3) onto those of another."""
+    (center, axes), (target, target_axes) = _principal_frame(moving), _principal_frame(fixed)
+    motions = []
+    for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)):
+        motion = torch.eye(4, dtype=torch.float64)
+        motion[:3, :3] = target_axes @ torch.diag(torch.tensor(signs, dtype=torch.float64)) @ axes.mT
+        motion[:3, 3] = target - motion[:3, :3] @ center
+        motions.append(motion)
+    return motions
+
+
+def _principal_frame(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre (3,) and principal axes (3, 3) in columns, a proper rotation."""
+    center = points.mean(0)
+    axes = torch.linalg.eigh((points - center).mT @ (points - center)).eigenvectors
+    axes[:, 0] *= torch.linalg.det(axes).sign()
+    return center, axes

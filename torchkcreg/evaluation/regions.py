@@ -1,0 +1,81 @@
+"""Regions of interest in reconstructed volumes, and what the volume holds there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from torchkcreg.geometry import VolumeGrid
+
+
+@dataclass(frozen=True)
+class RegionStatistics:
+    """A volume's values in a region.
+
+    Attributes:
+        num_voxels: how many voxels it has.
+        mean: their mean.
+        std: their standard deviation.
+        mean_error: mean minus that of a reference volume in the same voxels, where there is one.
+        std_error: standard deviation of the difference from it.
+    """
+
+    num_voxels: int
+    mean: float
+    std: float
+    mean_error: float | None = None
+    std_error: float | None = None
+
+
+def cylinder_region(grid: VolumeGrid, start: Sequence[float], end: Sequence[float], radius: float) -> Tensor:
+    """True for the voxels (D, H, W) whose centres lie in a cylinder between two points in world mm.
+
+    >>> int(cylinder_region(VolumeGrid.centered((5, 5, 5), 1.0), (0, 0, -1), (0, 0, 1), 1.0).sum())
+    15
+    """
+    if not radius > 0:
+        raise ValueError(f"radius must be positive, got {radius}")
+    points = grid.points(dtype=torch.float64)
+    first, axis = torch.tensor(start, dtype=torch.float64), torch.tensor(end, dtype=torch.float64)
+    axis = axis - first
+    along = ((points - first) @ axis) / (axis @ axis)
+    distance = (points - first - along[..., None] * axis).norm(dim=-1)
+    return (along >= 0) & (along <= 1) & (distance <= radius)
+
+
+def distance_to(filled: Tensor, grid: VolumeGrid) -> Tensor:
+    """Distances (D, H, W) in mm of voxel centres from the nearest voxel that is filled; infinite where none is.
+
+    Args:
+        filled: (D, H, W), true or above zero where the thing is.
+        grid: the voxels.
+    """
+    if not bool((filled > 0).any()):
+        return torch.full(grid.shape, torch.inf)
+    distances = distance_transform_edt((filled <= 0).cpu().numpy(), sampling=tuple(reversed(grid.spacing)))
+    return torch.from_numpy(distances).float()
+
+
+def region_statistics(volume: Tensor, region: Tensor, *, reference: Tensor | None = None) -> RegionStatistics:
+    """Mean and standard deviation of a volume (D, H, W) in a region, and how far it is from a reference.
+
+    Raises:
+        ValueError: shapes differ, or the region holds fewer than two voxels.
+
+    >>> region_statistics(torch.tensor([1.0, 3.0, 9.0]), torch.tensor([True, True, False])).mean
+    2.0
+    """
+    if volume.shape != region.shape or (reference is not None and reference.shape != volume.shape):
+        raise ValueError(f"volume, region and reference must have one shape, got {volume.shape} and {region.shape}")
+    values = volume[region.bool()].double()
+    if len(values) < 2:
+        raise ValueError(f"region must hold at least two voxels, got {len(values)}")
+    mean, std = float(values.mean()), float(values.std())
+    if reference is None:
+        return RegionStatistics(len(values), mean, std)
+    difference = values - reference[region.bool()].double()
+    return RegionStatistics(len(values), mean, std, float(difference.mean()), float(difference.std()))

@@ -1,0 +1,216 @@
+"""Capture range: from how far off the rigid stages of a registration still find an implant."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import fmean, median
+
+import torch
+from torch import Tensor
+
+from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
+from torchkcreg.implant import Component, ImplantPointCloud
+from torchkcreg.physics import line_integrals_from_intensity
+from torchkcreg.registration import RegistrationConfig, RegistrationData, RegistrationResult, Stage, register
+from torchkcreg.simulation import Load, SimulatedCase, weight_bearing_case
+
+MISALIGNED = Load(rotation_deg=(0.4, -0.5, 0.6), translation_mm=(0.8, -0.7, 1.0))  # moved as a whole, not bent
+DEFAULT_OFFSETS = (2.0, 5.0, 10.0, 15.0)
+CAPTURED_MM = 0.2
+_FEW_NODES = 8  # times coarser than the cloud: a rigid error needs no more
+
+
+@dataclass(frozen=True)
+class CaptureTrial:
+    """One registration from a random start.
+
+    Attributes:
+        offset: Distance in mm and angle in degrees of the start pose from the truth.
+        start_mm: RMS distance of the implant's nodes from their true places at the start.
+        error_mm: The same at the end.
+        basin_mm: RMS distance from where a start at the truth ends: above a few tenths, it is another minimum.
+        gc: Gradient correlation at the end, mean of the views.
+        seconds: Duration.
+    """
+
+    offset: float
+    start_mm: float
+    error_mm: float
+    basin_mm: float
+    gc: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class CaptureStudy:
+    """Registrations from random starts at several offsets.
+
+    Attributes:
+        trials: All of them, offset after offset.
+        captured_mm: Rigid error (RMS over the implant's nodes) below which a start counts as captured.
+    """
+
+    trials: tuple[CaptureTrial, ...]
+    captured_mm: float = CAPTURED_MM
+
+    @property
+    def offsets(self) -> tuple[float, ...]:
+        """The offsets, in the order in which they were run."""
+        return tuple(dict.fromkeys(trial.offset for trial in self.trials))
+
+    def at(self, offset: float) -> list[CaptureTrial]:
+        """The trials at one offset."""
+        return [trial for trial in self.trials if trial.offset == offset]
+
+    def captured_share(self, offset: float) -> float:
+        """Share of the starts at an offset that end below ``captured_mm``."""
+        return _share([trial.error_mm < self.captured_mm for trial in self.at(offset)])
+
+    def basin_share(self, offset: float) -> float:
+        """Share of the starts that end within ``captured_mm`` of where a start at the truth ends, biased or not."""
+        return _share([trial.basin_mm < self.captured_mm for trial in self.at(offset)])
+
+    def table(self) -> str:
+        """A Markdown table, a row an offset.
+
+        >>> trials = CaptureTrial(5.0, 7.1, 0.04, 0.01, 0.9, 2.0), CaptureTrial(5.0, 6.5, 3.0, 3.0, 0.2, 2.0)
+        >>> print(CaptureStudy(trials).table())
+        | start off by | starts | RMS (mm) | captured | right minimum | median error (mm) | largest (mm) | median s |
+        | --- | --- | --- | --- | --- | --- | --- | --- |
+        | 5 mm, 5 deg | 2 | 6.8 | 50 % | 50 % | 1.520 | 3.000 | 2.0 |
+        """
+        columns = ("start off by", "starts", "RMS (mm)", "captured", "right minimum", "median error (mm)")
+        rows = [[*columns, "largest (mm)", "median s"], ["---"] * 8]
+        for offset in self.offsets:
+            trials = self.at(offset)
+            shares = (f"{100 * share:.0f} %" for share in (self.captured_share(offset), self.basin_share(offset)))
+            errors = [trial.error_mm for trial in trials]
+            rows.append(
+                [
+                    f"{offset:g} mm, {offset:g} deg",
+                    str(len(trials)),
+                    f"{fmean(trial.start_mm for trial in trials):.1f}",
+                    *shares,
+                    f"{median(errors):.3f}",
+                    f"{max(errors):.3f}",
+                    f"{median(trial.seconds for trial in trials):.1f}",
+                ]
+            )
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def capture_study(
+    *,
+    offsets: Sequence[float] = DEFAULT_OFFSETS,
+    num_starts: int = 20,
+    views: Sequence[int] = (47, 48, 49),
+    config: RegistrationConfig | None = None,
+    known: bool = True,
+    seed: int = 0,
+    binning: int = 1,
+    captured_mm: float = CAPTURED_MM,
+    on_trial: Callable[[CaptureTrial], None] = lambda trial: None,
+) -> CaptureStudy:
+    """How many random starts the rigid stages of a registration bring home, at each offset.
+
+    The simulated plate has moved but is not bent, so that its true pose is rigid: a bent one would have a rigid optimum
+    that depends on the similarity. Only the stages of one group run. The error is the RMS distance of the implant's
+    nodes from their true places.
+
+    Args:
+        offsets: How far the starts are off: so many mm in a random direction, and so many degrees about a random axis
+            through the implant's centre, both at once.
+        num_starts: Starts at each offset.
+        views: Views of the simulated scan, see `torchkcreg.simulation.weight_bearing_case`.
+        config: Options whose rigid stages run; the defaults with the implant's material when None.
+        known: The registration is told the screws.
+        seed: Seed of the noise, the starts and the optimiser.
+        binning: Pixels along each side that are binned into one before anything else.
+        captured_mm: Error below which a start counts as captured.
+        on_trial: Called after each registration.
+
+    Raises:
+        ValueError: If no offset or start is asked for, or the configuration has no stage of one group.
+    """
+    if not offsets or num_starts < 1 or not all(math.isfinite(offset) and offset >= 0 for offset in offsets):
+        raise ValueError(f"offsets must be one or more, not negative, each with a start, got {offsets}, {num_starts}")
+    case = weight_bearing_case(MISALIGNED, seed=seed, views=views, binning=binning)
+    config = rigid_stages(config or RegistrationConfig(material=case.implant_material))
+    data, implant, screws = registration_inputs(case, config.pitch_mm)
+    nodes = implant.coarsened(_FEW_NODES).points.double()
+    truth = case.deform(nodes)
+    pose = fit_rigid(nodes, truth)
+
+    def run(start: Tensor, number: int) -> RegistrationResult:
+        return register(
+            implant,
+            data,
+            config.model_copy(update={"seed": seed + number}),
+            spectrum=case.spectrum if config.material else None,
+            components=screws if known else (),
+            implant_to_world=start,
+        )
+
+    best = run(pose, 0).warp(nodes)
+    trials = []
+    for offset in offsets:
+        generator = torch.Generator().manual_seed(seed)  # the same directions at each offset
+        for number in range(num_starts):
+            start = random_pose(pose, offset, nodes.mean(0), generator)
+            begin = time.perf_counter()
+            result = run(start, number)
+            end = result.warp(nodes)
+            trial = CaptureTrial(
+                offset=float(offset),
+                start_mm=_rms(transform_points(start, nodes) - truth),
+                error_mm=_rms(end - truth),
+                basin_mm=_rms(end - best),
+                gc=float(result.gc.mean()),
+                seconds=time.perf_counter() - begin,
+            )
+            trials.append(trial)
+            on_trial(trial)
+    return CaptureStudy(tuple(trials), captured_mm)
+
+
+def rigid_stages(config: RegistrationConfig) -> RegistrationConfig:
+    """The configuration with its stages of one group alone.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    stages: tuple[Stage, ...] = tuple(stage for stage in config.schedule() if stage.groups == 1)
+    if not stages:
+        raise ValueError("the configuration has no rigid stage (groups: 1)")
+    return config.model_copy(update={"stages": stages})
+
+
+def registration_inputs(
+    case: SimulatedCase, pitch_mm: float = 0.25
+) -> tuple[RegistrationData, ImplantPointCloud, list[Component]]:
+    """Projections, implant and screws of a simulated case as a registration takes them."""
+    lines, mask = line_integrals_from_intensity(case.intensity, case.open_beam, saturation=case.saturation)
+    screws = [
+        Component.screw(f"screw{i}", s["from"], s["to"], s["radius"], material=s["material"], pitch=pitch_mm)
+        for i, s in enumerate(case.screws)
+    ]
+    return RegistrationData(case.geometry, lines, mask), ImplantPointCloud.from_mesh(case.implant, pitch_mm), screws
+
+
+def random_pose(pose: Tensor, offset: float, center: Tensor, generator: torch.Generator) -> Tensor:
+    """A pose (4, 4) off by ``offset`` mm and ``offset`` degrees about ``center`` (3,) of the implant's frame."""
+    turn, shift = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
+    motion = rigid_matrix(turn * math.radians(offset), offset * shift)
+    motion[:3, 3] += center - motion[:3, :3] @ center
+    return pose @ motion
+
+
+def _rms(vectors: Tensor) -> float:
+    return float(vectors.square().sum(-1).mean().sqrt())
+
+
+def _share(flags: list[bool]) -> float:
+    return sum(flags) / len(flags)

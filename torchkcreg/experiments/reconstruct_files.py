@@ -1,0 +1,226 @@
+"""A reconstruction from files to a folder: volumes, what was measured, figures."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as distributed
+from pydantic import ValidationError
+from torch import Tensor
+
+from torchkcreg.io import RunFolder, read_config, read_volume, write_volume
+from torchkcreg.physics import material
+from torchkcreg.reconstruction import (
+    PWLS,
+    FDKConfig,
+    PWLSConfig,
+    ViewShard,
+    fdk,
+    hounsfield,
+    known_materials,
+    prepare,
+    reconstruct,
+    with_components,
+)
+from torchkcreg.visualization import reconstruction_figure
+
+from .reconstruction_inputs import (
+    ReconstructionFiles,
+    ReconstructionInputs,
+    ReconstructionOptions,
+    read_reconstruction_inputs,
+)
+
+CHECKPOINT_EVERY = 5
+OUTPUTS = ("volume.mha", "volume_hu.mha", "with_implant.mha", "slices.png")
+
+
+def resolve_options(overrides: dict[str, Any], config: Path | None = None) -> ReconstructionOptions:
+    """Options of a YAML or JSON file with overrides on top.
+
+    Raises:
+        ValueError: For unknown keys and wrong values, in one line that names them.
+    """
+    options = read_config(config) if config is not None else {}
+    try:
+        return ReconstructionOptions.model_validate({**options, **overrides})
+    except ValidationError as error:
+        problems = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        raise ValueError(f"options: {'; '.join(problems)}") from None
+
+
+def reconstruct_files(
+    files: ReconstructionFiles,
+    out: Path,
+    options: ReconstructionOptions,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    figures: bool = True,
+) -> dict[str, Any]:
+    """What was measured of a reconstruction whose folder is written to ``out``.
+
+    The folder holds ``volume.mha`` in 1/mm (behind known components the background alone), ``volume_hu.mha``,
+    ``with_implant.mha`` (with known components), ``metrics.json``, ``config.yaml`` and ``slices.png``. Under
+    ``torchrun`` the views are shared out over the processes and the first one writes.
+
+    Args:
+        files: What is reconstructed.
+        out: Folder to make.
+        options: How.
+        overwrite: Replace a reconstruction that is there.
+        resume: Continue one that was stopped; it must have been started with the same files and options.
+        figures: Draw slices.
+
+    Raises:
+        ValueError: If files or options are wrong, or a resumed run was started with other ones.
+        FileNotFoundError: If a file is missing.
+        FileExistsError: If ``out`` holds a run and neither overwrite nor resume was asked.
+    """
+    start = time.perf_counter()
+    inputs = read_reconstruction_inputs(files, options)
+    with _processes() as rank:
+        shard = ViewShard.of(inputs.geometry.num_views) if distributed.is_initialized() else None
+        record = _record(files, options)
+        run = _folder(out, record, overwrite=overwrite, resume=resume) if rank == 0 else None
+        state = RunFolder(out).load_checkpoint() if resume else None
+        volume, history = _reconstructed(files, inputs, options, shard, run, state)
+        metrics = _metrics(inputs, volume, history, time.perf_counter() - start)
+        if run is not None:
+            _write(run, inputs, volume, metrics, figures)
+    return metrics
+
+
+def _reconstructed(
+    files: ReconstructionFiles,
+    inputs: ReconstructionInputs,
+    options: ReconstructionOptions,
+    shard: ViewShard | None,
+    run: RunFolder | None,
+    state: dict[str, Any] | None,
+) -> tuple[Tensor, list[dict[str, Any]]]:
+    geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
+    if options.method == "fdk":
+        data = prepare(inputs.transmission, geometry, inputs.beam, scatter=inputs.scatter, mask=inputs.mask)
+        ramp = FDKConfig(window=options.window)
+        return fdk(data.line_integrals, geometry, grid, config=ramp, shard=shard, backend=backend), []
+    changes = {name: getattr(options, name) for name in ("iterations", "subsets") if getattr(options, name) is not None}
+    config = PWLSConfig.preset(options.preset, beta=options.beta, **changes)
+    initial = None
+    if files.initial is not None:
+        initial, its_grid = read_volume(files.initial)
+        if its_grid.shape != grid.shape:
+            raise ValueError(f"initial volume {files.initial} has shape {its_grid.shape}, the grid has {grid.shape}")
+    result = reconstruct(
+        inputs.transmission,
+        geometry,
+        grid,
+        inputs.beam,
+        config=config,
+        components=inputs.components,
+        scatter=inputs.scatter,
+        mask=inputs.mask,
+        passes=options.passes,
+        initial=initial,
+        shard=shard,
+        backend=backend,
+        callback=None if run is None else _checkpoints(run, config.iterations),
+        state=state,
+        progress=None if run is not None else False,
+    )
+    return result.volume, result.history
+
+
+def _checkpoints(run: RunFolder, iterations: int) -> Callable[[int, PWLS, dict[str, Any]], None]:
+    def keep(index: int, solver: PWLS, record: dict[str, Any]) -> None:
+        if record["iteration"] % CHECKPOINT_EVERY == 0 or record["iteration"] == iterations:
+            run.save_checkpoint({"pass": index, "solver": solver.state_dict(), "volume": solver.initial})
+
+    return keep
+
+
+def _metrics(
+    inputs: ReconstructionInputs, volume: Tensor, history: list[dict[str, Any]], seconds: float
+) -> dict[str, Any]:
+    scatter, beam = inputs.scatter, inputs.beam
+    return {
+        "shape": list(volume.shape),
+        "spacing_mm": list(inputs.grid.spacing),
+        "mean": float(volume.mean()),
+        "largest": float(volume.max()),
+        "reference_kev": beam.reference_kev,
+        "water": beam.water,
+        "scatter": None if scatter is None else {"fraction": scatter.fraction, "sigma_mm": scatter.sigma_mm},
+        "components": [component.material for component in inputs.components],
+        "history": history,
+        "seconds": seconds,
+    }
+
+
+def _write(
+    run: RunFolder, inputs: ReconstructionInputs, volume: Tensor, metrics: dict[str, Any], figures: bool
+) -> None:
+    grid, beam = inputs.grid, inputs.beam
+    shown = {"reconstruction": volume}
+    write_volume(run.path / "volume.mha", volume, grid)
+    write_volume(run.path / "volume_hu.mha", hounsfield(volume, beam.water).round().to(torch.int32), grid)
+    metal = None
+    if inputs.components:
+        energy = beam.reference_kev
+        if energy is None:
+            values = [float(row[0]) for row in beam.attenuation]
+        else:
+            values = [float(material(m).attenuation((energy,))[0]) for m in known_materials(inputs.components)]
+        whole = with_components(volume, inputs.components, grid, values)
+        write_volume(run.path / "with_implant.mha", whole, grid)
+        shown = {"background": volume, "with the implant": whole}
+        metal = sum((component.fraction(grid) for component in inputs.components), torch.zeros(grid.shape))
+    if figures:
+        middle, reach = grid.origin[2] + grid.size_mm[2] / 2, grid.size_mm[2] / 4
+        heights = (middle - reach, middle, middle + reach) if grid.shape[0] > 3 else (middle,)
+        window = (0.0, 2 * beam.water)
+        run.write_figure(
+            "slices.png", reconstruction_figure(shown, grid, heights_mm=heights, window=window, metal=metal)
+        )
+    run.write_metrics(metrics)
+
+
+def _record(files: ReconstructionFiles, options: ReconstructionOptions) -> dict[str, Any]:
+    names = {k: str(v.resolve()) if isinstance(v, Path) else v for k, v in vars(files).items() if v is not None}
+    return {"files": names, "reconstruction": options.model_dump(mode="json")}
+
+
+def _folder(out: Path, record: dict[str, Any], *, overwrite: bool, resume: bool) -> RunFolder:
+    run = RunFolder.create(out, overwrite=overwrite, resume=resume)
+    if resume:
+        kept = read_config(run.path / "config.yaml")
+        changed = sorted(key for key in kept.keys() | record.keys() if kept.get(key) != record.get(key))
+        if changed:
+            raise ValueError(f"run folder {run.path} was started with other {' and '.join(changed)}")
+        return run
+    for name in OUTPUTS:
+        (run.path / name).unlink(missing_ok=True)
+    run.start(record)
+    return run
+
+
+@contextmanager
+def _processes() -> Iterator[int]:
+    """The rank of this process; torch.distributed runs inside where ``torchrun`` started several."""
+    if int(os.environ.get("WORLD_SIZE", "1")) < 2:
+        yield 0
+        return
+    started = not distributed.is_initialized()
+    if started:
+        distributed.init_process_group("gloo")
+    try:
+        yield distributed.get_rank()
+    finally:
+        if started:
+            distributed.destroy_process_group()

@@ -1,0 +1,187 @@
+"""What a reconstruction is made from: files, options, and what they hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.io import read_config, read_geometry, read_projections, read_spectrum
+from torchkcreg.physics import Spectrum, material, tungsten_spectrum
+from torchkcreg.reconstruction import (
+    BeamModel,
+    KnownComponent,
+    Veil,
+    field_of_view_grid,
+    fit_veil,
+    known_materials,
+)
+
+from .registered_components import registered_components
+
+
+@dataclass(frozen=True)
+class ReconstructionFiles:
+    """The files of a reconstruction; what is not given comes from the run.
+
+    Attributes:
+        run: Folder of a finished registration: the implant in its place.
+        geometry: Projection matrices.
+        projections: Intensities or line integrals of all views.
+        spectrum: Detected spectrum.
+        components: Screws to take instead of the run's.
+        open_beam: Unattenuated intensity where the projections' file does not say it.
+        initial: Volume to start PWLS from.
+    """
+
+    run: Path | None = None
+    geometry: Path | None = None
+    projections: Path | None = None
+    spectrum: Path | None = None
+    components: Path | None = None
+    open_beam: float | None = None
+    initial: Path | None = None
+
+
+class ReconstructionOptions(BaseModel):
+    """Options of a reconstruction; unknown keys are refused.
+
+    Attributes:
+        method: "fdk"; "pwls"; "kcrec", PWLS of what the registered implant leaves.
+        spacing_mm: Edge of a voxel.
+        size_mm: Size (x, y, z) of the volume; the field of view if None.
+        center_mm: Its middle (x, y, z), where a size is given.
+        preset: "momentum" or "paper" (500 iterations of 20 subsets).
+        iterations: Overrides the preset's.
+        subsets: Overrides the preset's.
+        beta: Weight of the roughness.
+        passes: Of the iterative methods; from the second on, mineral's hardening and the scatter in the metal's shadow
+            are known from the pass before.
+        window: Of the ramp.
+        scatter: "auto" fits a smooth one to the air around the object, "none", or its fraction of the primary.
+        scatter_sigma_mm: How broad a given fraction's scatter is.
+        monoenergetic: One energy, as in the paper, even where a spectrum is known.
+        material: The implant's, where the registration had none.
+        backend: Projector: "auto", "cpp" or "torch".
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: Literal["fdk", "pwls", "kcrec"] = "fdk"
+    spacing_mm: float = Field(0.8, gt=0)
+    size_mm: tuple[float, float, float] | None = None
+    center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    preset: Literal["momentum", "paper"] = "momentum"
+    iterations: int | None = Field(None, ge=1)
+    subsets: int | None = Field(None, ge=1)
+    beta: float = Field(10.0, ge=0)
+    passes: int = Field(1, ge=1)
+    window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = "hann"
+    scatter: Literal["auto", "none"] | float = "auto"
+    scatter_sigma_mm: float = Field(40.0, gt=0)
+    monoenergetic: bool = False
+    material: str | None = None
+    backend: Literal["auto", "cpp", "torch"] = "auto"
+
+
+@dataclass(frozen=True)
+class ReconstructionInputs:
+    """What files and options amount to.
+
+    Attributes:
+        geometry: All views.
+        transmission: Measured intensity over the open beam's, (V, rows, cols).
+        mask: 0 where a pixel holds no measurement.
+        grid: The voxels.
+        beam: Energies and the metals' attenuation.
+        scatter: Smooth scatter, None for none.
+        components: The metal in its place; none but for "kcrec".
+    """
+
+    geometry: ConeBeamGeometry
+    transmission: Tensor
+    mask: Tensor
+    grid: VolumeGrid
+    beam: BeamModel
+    scatter: Veil | None
+    components: list[KnownComponent]
+
+
+def read_reconstruction_inputs(files: ReconstructionFiles, options: ReconstructionOptions) -> ReconstructionInputs:
+    """The inputs of a reconstruction; nothing is written.
+
+    Raises:
+        ValueError: Files that are malformed or don't fit together, or a file that neither flag nor run names.
+        FileNotFoundError: A file is missing.
+    """
+    files = _completed(files)
+    if files.geometry is None or files.projections is None:
+        raise ValueError("a reconstruction needs geometry and projections, or a run that names them")
+    geometry = read_geometry(files.geometry)
+    projections = read_projections(files.projections, open_beam=files.open_beam)
+    projections.check_against(geometry)
+    components = []
+    if options.method == "kcrec":
+        if files.run is None:
+            raise ValueError("method kcrec needs the run of a registration: name it with --run")
+        components = registered_components(files.run, components=files.components, material=options.material)
+    transmission = torch.exp(-projections.line_integrals)
+    return ReconstructionInputs(
+        geometry,
+        transmission,
+        projections.mask,
+        _grid(geometry, options),
+        _beam(files, options, components),
+        _scatter(transmission, projections.mask, geometry, options, saturated=projections.num_saturated > 0),
+        components,
+    )
+
+
+def _completed(files: ReconstructionFiles) -> ReconstructionFiles:
+    """Files with those that the run was made from where none are given."""
+    if files.run is None:
+        return files
+    record = read_config(files.run / "config.yaml").get("files") or {}
+    names = ("geometry", "projections", "spectrum")
+    own = {name: getattr(files, name) or (Path(record[name]) if record.get(name) else None) for name in names}
+    open_beam = files.open_beam if files.open_beam is not None else record.get("open_beam")
+    return ReconstructionFiles(
+        run=files.run, components=files.components, open_beam=open_beam, initial=files.initial, **own
+    )
+
+
+def _grid(geometry: ConeBeamGeometry, options: ReconstructionOptions) -> VolumeGrid:
+    if options.size_mm is None:
+        return field_of_view_grid(geometry, options.spacing_mm)
+    if min(options.size_mm) <= 0:
+        raise ValueError(f"size_mm must be positive, got {options.size_mm}")
+    shape = [max(1, round(size / options.spacing_mm)) for size in reversed(options.size_mm)]
+    return VolumeGrid.centered(shape, options.spacing_mm, center=options.center_mm)
+
+
+def _beam(files: ReconstructionFiles, options: ReconstructionOptions, components: list[KnownComponent]) -> BeamModel:
+    spectrum: Spectrum | None = read_spectrum(files.spectrum) if files.spectrum is not None else None
+    metals = [material(name) for name in known_materials(components)]
+    if options.monoenergetic or (spectrum is None and not components):
+        energy = (spectrum or tungsten_spectrum()).mean_energy
+        water = float(material("water").attenuation((energy,))[0])
+        return BeamModel.monoenergetic([float(m.attenuation((energy,))[0]) for m in metals], water=water)
+    return BeamModel.polyenergetic(metals, spectrum or tungsten_spectrum())
+
+
+def _scatter(
+    transmission: Tensor, mask: Tensor, geometry: ConeBeamGeometry, options: ReconstructionOptions, *, saturated: bool
+) -> Veil | None:
+    if options.scatter == "none":
+        return None
+    if options.scatter != "auto":
+        return Veil(float(options.scatter), options.scatter_sigma_mm)
+    usable = mask.bool()
+    if saturated:  # a full pixel says only that there is at least as much
+        usable = usable & (transmission < 0.9999 * transmission.max())
+    return fit_veil(transmission, geometry.pixel_spacing, mask=usable)

@@ -1,0 +1,63 @@
+"""The metal of a finished registration in its place: bent plate and screws as known components."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import trimesh
+
+from torchkcreg.evaluation import deformed_surface
+from torchkcreg.geometry import fit_rigid, transform_points
+from torchkcreg.implant import ImplantPointCloud, cylinder_mesh
+from torchkcreg.io import ComponentSpec, read_components, read_config, read_mesh, read_run
+from torchkcreg.reconstruction import KnownComponent
+from torchkcreg.registration import RegistrationResult
+from torchkcreg.registration.scene import followed_points
+
+
+def registered_components(
+    run: Path, *, components: Path | None = None, material: str | None = None, pitch_mm: float | None = None
+) -> list[KnownComponent]:
+    """The implant of a run as it was registered, then its screws, in world mm.
+
+    Args:
+        run: folder of a finished registration.
+        components: screws to take instead of those of the registration; each follows the implant near its head.
+        material: the implant's, where the registration had none.
+        pitch_mm: of the nodes; the registration's if None.
+
+    Raises:
+        ValueError: nothing says what the implant is made of.
+        FileNotFoundError: the run is not finished, or a file it was made from is gone.
+    """
+    result, files, options = read_run(run), *_record(run)
+    name = material or options.get("material")
+    if name is None:
+        raise ValueError(f"run {run} was registered without a material: name the implant's with --material")
+    pitch = pitch_mm or float(options.get("pitch_mm", 0.25))
+    mesh = read_mesh(files["implant"])
+    known = [KnownComponent.from_mesh(deformed_surface(result, mesh, longest_edge_mm=2.0), name, pitch=pitch)]
+    path = components or (Path(files["components"]) if files.get("components") else None)
+    specs = read_components(path) if path is not None else []
+    screws = [KnownComponent.from_mesh(_placed_screw(s, mesh, result), s.material, pitch=pitch) for s in specs]
+    return [*known, *screws]
+
+
+def _record(run: Path) -> tuple[dict, dict]:
+    content = read_config(Path(run) / "config.yaml")
+    return content.get("files") or {}, content.get("options") or {}
+
+
+def _placed_screw(spec: ComponentSpec, mesh: trimesh.Trimesh, result: RegistrationResult) -> trimesh.Trimesh:
+    screw = cylinder_mesh(spec.start, spec.end, spec.radius)
+    motion = result.components.get(spec.name)
+    if motion is None:
+        nodes = ImplantPointCloud.from_mesh(mesh, 1.0, dtype=torch.float64).points
+        radius = result.config.follow_radius_mm
+        near = followed_points(nodes, torch.tensor(spec.start, dtype=torch.float64), radius)
+        pose = fit_rigid(near, result.warp(near))
+    else:
+        pose = result.implant_to_world.double() @ motion.double()
+    vertices = transform_points(pose, torch.from_numpy(screw.vertices.copy()))
+    return trimesh.Trimesh(vertices.numpy(), screw.faces, process=False)

@@ -1,0 +1,250 @@
+"""Path integrals through a voxel volume, their exact adjoint, and the weighted back-projection of FDK."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchkcreg.geometry import VolumeGrid
+
+from .voxel_ops import voxel_backproject, voxel_backproject_weighted, voxel_project
+
+Views = slice | Sequence[int] | Tensor | None
+
+
+def project_volume(
+    volume: Tensor,  # (..., D, H, W)
+    grid: VolumeGrid,
+    projection_matrices: Tensor,  # (V, 3, 4)
+    det_shape: tuple[int, int],
+    *,
+    backend: str = "auto",
+) -> Tensor:  # (..., V, rows, cols)
+    """Path integral (value x mm) of a volume along the ray of each pixel centre, by Joseph's method.
+
+    A ray is sampled where it crosses the lattice planes of the axis along which its voxel index changes most, by
+    bilinear interpolation in the plane (Joseph, IEEE Trans. Med. Imaging 1(3), 1982), and starts at the source. Beyond
+    the outermost voxel centres the volume fades to zero over one voxel, so that every voxel counts in full; what is
+    outside the grid is air, and a ray that misses it is zero.
+
+    Differentiable in the volume, any number of times: the gradient is `backproject`. The matrices count as constant.
+
+    Args:
+        volume: values, 1/mm for line integrals of attenuation, shape (..., D, H, W); leading axes are candidates.
+        grid: where its voxels are; any direction.
+        projection_matrices: shape (V, 3, 4), world mm to homogeneous 0-based pixels; any invertible left part, any
+            scale. The side of the source on which the grid's centre is counts as the front.
+        det_shape: (rows, cols) of the detector.
+        backend: "auto" (C++ on the CPU if it can be had, else torch), "cpp" or "torch". All give the same numbers.
+
+    Returns:
+        Images of the volume's dtype, shape (..., V, rows, cols), same bits for every number of threads.
+
+    Raises:
+        ValueError: where shapes, dtypes or devices don't fit, matrices are not finite, not invertible or require a
+            gradient, or the backend doesn't exist.
+        OSError: for ``backend="cpp"`` where the C++ kernels can't be had.
+
+    >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])  # 1000 px of focal length
+    >>> grid = VolumeGrid.centered((10, 20, 20), 0.5)
+    >>> images = project_volume(torch.full(grid.shape, 0.02), grid, P, (65, 65))  # through 5 mm of water or so
+    >>> round(float(images[0, 32, 32]), 4)
+    0.1
+    """
+    rays, spacing = _rays(grid, projection_matrices, volume)
+    _check_batch("volume", volume, grid.shape)
+    rows, cols = _checked_det_shape(det_shape)
+    flat = _flat(volume)
+    return voxel_project(flat, rays, spacing, rows, cols, backend=backend).reshape(
+        *volume.shape[:-3], len(rays), rows, cols
+    )
+
+
+def backproject(
+    projections: Tensor,  # (..., V, rows, cols)
+    grid: VolumeGrid,
+    projection_matrices: Tensor,  # (V, 3, 4)
+    *,
+    backend: str = "auto",
+) -> Tensor:  # (..., D, H, W)
+    """The adjoint of `project_volume`: for each voxel the sum of all pixels, weighted as the pixels see the voxel.
+
+    ``<project_volume(x), y> = <x, backproject(y)>`` up to rounding. Differentiable in the projections; the gradient is
+    `project_volume`. A subset of views is a slice of both (``projections[..., 3::10, :, :]``, ``matrices[3::10]``),
+    which copies no images.
+
+    Args:
+        projections: images, shape (..., V, rows, cols).
+        grid: the voxels to fill.
+        projection_matrices: shape (V, 3, 4), as for `project_volume`.
+        backend: "auto", "cpp" or "torch".
+
+    Returns:
+        Volume of the projections' dtype, shape (..., D, H, W), zero where no ray passes; same bits for every number of
+        threads.
+
+    Raises:
+        ValueError: as `project_volume`.
+        OSError: as `project_volume`.
+
+    >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])
+    >>> grid = VolumeGrid.centered((10, 20, 20), 0.5)
+    >>> backproject(torch.ones(1, 65, 65), grid, P).shape
+    torch.Size([10, 20, 20])
+    """
+    rays, spacing = _rays(grid, projection_matrices, projections)
+    flat = _flat_images(projections, len(rays))
+    volume = voxel_backproject(flat, rays, spacing, grid.shape, backend=backend)
+    return volume.reshape(*projections.shape[:-3], *grid.shape)
+
+
+def backproject_weighted(
+    projections: Tensor,  # (..., V, rows, cols)
+    grid: VolumeGrid,
+    projection_matrices: Tensor,  # (V, 3, 4)
+    *,
+    backend: str = "auto",
+) -> Tensor:  # (..., D, H, W)
+    """Voxel-driven back-projection with FDK's weight: ``sum over views of image(u, v) / depth^2``, depth in mm.
+
+    The image is interpolated bilinearly where the centre of the voxel projects to, and fades to zero over one pixel
+    beyond the outermost pixel centres. Voxels behind the source get nothing. Not the adjoint of `project_volume`: it
+    is what inversion formulas need (Feldkamp, Davis, Kress, J. Opt. Soc. Am. A 1(6), 1984).
+
+    Differentiable in the projections.
+
+    Args:
+        projections: filtered images, shape (..., V, rows, cols).
+        grid: the voxels to fill.
+        projection_matrices: shape (V, 3, 4), as for `project_volume`.
+        backend: "auto", "cpp" or "torch".
+
+    Returns:
+        Volume of the projections' dtype, shape (..., D, H, W), same bits for every number of threads.
+
+    Raises:
+        ValueError: as `project_volume`.
+        OSError: as `project_volume`.
+
+    >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])
+    >>> volume = backproject_weighted(torch.ones(1, 65, 65), VolumeGrid((1, 1, 1)), P)
+    >>> round(float(volume * 500**2), 4)
+    1.0
+    """
+    matrices = _checked_matrices(grid, projection_matrices, projections)
+    flat = _flat_images(projections, len(matrices))
+    matrices = matrices @ grid.voxel_to_world.to(matrices.device)
+    volume = voxel_backproject_weighted(flat, matrices, grid.shape, backend=backend)
+    return volume.reshape(*projections.shape[:-3], *grid.shape)
+
+
+class VolumeProjector(nn.Module):
+    """Path integrals of a grid's volumes in the views of a geometry, and the adjoint; `project_volume` as a module.
+
+    Args:
+        geometry: anything with ``projection_matrices`` (V, 3, 4) and ``det_shape`` (rows, cols), a
+            ``ConeBeamGeometry`` for one. A module moves with this one.
+        grid: where the voxels are.
+        backend: "auto", "cpp" or "torch".
+
+    >>> from torchkcreg.geometry import circular_geometry
+    >>> geometry = circular_geometry(range(0, 360, 6), sad=404, sdd=538, det_shape=(48, 64), pixel_spacing=(2.0, 2.0))
+    >>> projector = VolumeProjector(geometry, VolumeGrid.centered((8, 16, 16), 2.0))
+    >>> images = projector(torch.ones(8, 16, 16), views=slice(0, None, 10))
+    >>> images.shape, projector.adjoint(images, views=slice(0, None, 10)).shape
+    (torch.Size([6, 48, 64]), torch.Size([8, 16, 16]))
+    """
+
+    def __init__(self, geometry, grid: VolumeGrid, *, backend: str = "auto") -> None:
+        super().__init__()
+        self.geometry = geometry
+        self.grid = grid
+        self.backend = backend
+
+    def forward(self, volume: Tensor, *, views: Views = None) -> Tensor:
+        """Images (..., n, rows, cols) of a volume (..., D, H, W) in n views, all of them if `views` is None."""
+        return project_volume(volume, self.grid, self._matrices(views), self.geometry.det_shape, backend=self.backend)
+
+    def adjoint(self, projections: Tensor, *, views: Views = None) -> Tensor:
+        """Volume (..., D, H, W) from the images (..., n, rows, cols) of n views; see `backproject`."""
+        matrices = self._matrices(views)
+        if tuple(projections.shape[-2:]) != tuple(self.geometry.det_shape):
+            rows, cols = self.geometry.det_shape
+            raise ValueError(f"projections must have shape (..., V, {rows}, {cols}), got {tuple(projections.shape)}")
+        return backproject(projections, self.grid, matrices, backend=self.backend)
+
+    def _matrices(self, views: Views) -> Tensor:
+        matrices = self.geometry.projection_matrices
+        if views is None:
+            return matrices
+        if isinstance(views, slice):
+            return matrices[views]
+        chosen = torch.as_tensor(views, device=matrices.device)
+        if chosen.dim() != 1 or chosen.dtype == torch.bool or chosen.is_floating_point():
+            raise ValueError(f"views must be a slice or a list of view indices, got {views}")
+        if bool(((chosen < -len(matrices)) | (chosen >= len(matrices))).any()):
+            raise ValueError(f"views must name some of the {len(matrices)} views, got {chosen.tolist()}")
+        return matrices[chosen]
+
+    def extra_repr(self) -> str:
+        return f"grid={self.grid}, backend={self.backend!r}"
+
+
+def _rays(grid: VolumeGrid, matrices: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:
+    """``[D | s]`` of each view in voxel indices, (V, 3, 4), and the voxel spacing (3,), both in float64.
+
+    With ``Q = [M | q]`` the matrix from voxel index to pixel, ``D = M^-1`` and ``s = -M^-1 q``.
+    """
+    checked = _checked_matrices(grid, matrices, data)
+    to_pixels = checked @ grid.voxel_to_world.to(checked.device)
+    inverse = torch.linalg.inv(to_pixels[:, :, :3])
+    rays = torch.cat([inverse, -inverse @ to_pixels[:, :, 3:]], dim=-1)
+    return rays, torch.tensor(grid.spacing, dtype=torch.float64, device=data.device)
+
+
+def _checked_matrices(grid: VolumeGrid, matrices: Tensor, data: Tensor) -> Tensor:
+    """Matrices in float64 whose row 2 is the depth in mm, positive at the grid's centre."""
+    if data.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"volume and projections must be float32 or float64, got {data.dtype}")
+    if matrices.dim() != 3 or tuple(matrices.shape[1:]) != (3, 4):
+        raise ValueError(f"projection_matrices must have shape (V, 3, 4), got {tuple(matrices.shape)}")
+    if matrices.device != data.device:
+        raise ValueError(f"projection_matrices must be on the data's device {data.device}, got {matrices.device}")
+    if matrices.requires_grad:
+        raise ValueError("projection_matrices must not require a gradient: they count as constant, detach them")
+    matrices = matrices.double()
+    if not bool(matrices.isfinite().all()):
+        raise ValueError("projection_matrices must be finite")
+    normals = matrices[:, :, :3].norm(dim=-1, keepdim=True)
+    if bool((torch.linalg.det(matrices[:, :, :3] / normals.clamp_min(1e-300)).abs() < 1e-9).any()):
+        raise ValueError("projection_matrices must have an invertible left 3 x 3 part")
+    matrices = matrices / normals[:, 2:]
+    center = grid.voxel_to_world[:3] @ torch.tensor([*((n - 1) / 2 for n in grid.shape[::-1]), 1.0]).double()
+    depth = matrices[:, 2, :3] @ center.to(matrices.device) + matrices[:, 2, 3]
+    return torch.where(depth < 0, -1.0, 1.0)[:, None, None] * matrices
+
+
+def _flat(data: Tensor) -> Tensor:
+    """The data with all leading axes in one, for the last three."""
+    return data.reshape(math.prod(data.shape[:-3]), *data.shape[-3:])  # -1 is refused where there are no elements
+
+
+def _flat_images(projections: Tensor, num_views: int) -> Tensor:
+    if projections.dim() < 3 or projections.shape[-3] != num_views or 0 in projections.shape[-2:]:
+        shape = tuple(projections.shape)
+        raise ValueError(f"projections must have shape (..., V, rows, cols) with V = {num_views} matrices, got {shape}")
+    return _flat(projections)
+
+
+def _check_batch(name: str, data: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(data.shape[-len(shape) :]) != tuple(shape):
+        raise ValueError(f"{name} must have shape (..., {', '.join(map(str, shape))}), got {tuple(data.shape)}")
+
+
+def _checked_det_shape(det_shape: Sequence[int]) -> tuple[int, int]:
+    if len(det_shape) != 2 or any(int(n) != n or n < 1 for n in det_shape):
+        raise ValueError(f"det_shape must be (rows, cols), both positive, got {tuple(det_shape)}")
+    return int(det_shape[0]), int(det_shape[1])

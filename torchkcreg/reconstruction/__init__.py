@@ -1,0 +1,67 @@
+"""Reconstruction: filtered back-projection, penalised weighted least squares, known components.
+
+`fdk` for one or several focal spots; `pwls` with ordered subsets and momentum; `prepare` turns measured transmissions
+into line integrals and weights, with known components (KC-Rec), scatter and beam hardening accounted for.
+"""
+
+from .corrections import Veil, fit_veil, floored_line_integrals, refined_scatter, veil_image
+from .ct_numbers import hounsfield
+from .fdk import FDKConfig, fdk
+from .field_of_view import coverage, field_of_view_grid
+from .known_component import (
+    KnownComponent,
+    component_path_lengths,
+    component_shares,
+    known_materials,
+    unknown_share,
+    with_components,
+    without_components,
+)
+from .preparation import PreparedData, prepare
+from .pwls import PWLS, Reconstruction, pwls
+from .pwls_config import PWLSConfig
+from .roughness import quadratic_roughness
+from .sharding import ViewShard
+from .spectral import BeamModel, background_line_integrals, behind_metal, mineral_part
+from .subsets import ordered_subsets
+from .system import System, VoxelSystem
+from .weights import statistical_weights
+from .workflow import IterativeResult, reconstruct
+
+__all__ = [
+    "PWLS",
+    "BeamModel",
+    "FDKConfig",
+    "IterativeResult",
+    "KnownComponent",
+    "PWLSConfig",
+    "PreparedData",
+    "Reconstruction",
+    "System",
+    "Veil",
+    "ViewShard",
+    "VoxelSystem",
+    "background_line_integrals",
+    "behind_metal",
+    "component_path_lengths",
+    "component_shares",
+    "coverage",
+    "fdk",
+    "field_of_view_grid",
+    "fit_veil",
+    "floored_line_integrals",
+    "hounsfield",
+    "known_materials",
+    "mineral_part",
+    "ordered_subsets",
+    "prepare",
+    "pwls",
+    "quadratic_roughness",
+    "reconstruct",
+    "refined_scatter",
+    "statistical_weights",
+    "unknown_share",
+    "veil_image",
+    "with_components",
+    "without_components",
+]

@@ -1,0 +1,183 @@
+"""Filtered back-projection of cone-beam scans (Feldkamp, Davis and Kress 1984), with one or several focal spots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.projector import backproject_weighted
+
+from .axial_frame import axial_frame, columns_and_rows, is_aligned, rectified
+from .field_of_view import coverage
+from .filtering import filter_rows
+from .focal_spots import height_shares, views_by_source
+from .redundancy import AngularSampling, angular_sampling, full_scan_weights, is_offset, parker_weights
+from .sharding import ViewShard
+
+BLOCK_VIEWS = 16  # filtered together, to bound memory
+
+
+@dataclass(frozen=True)
+class FDKConfig:
+    """Options of `fdk`.
+
+    Attributes:
+        window: of the ramp: "ram-lak", "shepp-logan", "cosine", "hamming" or "hann".
+        cutoff: where the window ends, as a share of the highest frequency.
+        extrapolate: whether rows that the detector cuts off go on smoothly.
+        combine: whether each focal spot's views make a volume of their own, mixed by height; otherwise all views are
+            taken for one scan.
+    """
+
+    window: str = "ram-lak"
+    cutoff: float = 1.0
+    extrapolate: bool = True
+    combine: bool = True
+
+
+def fdk(
+    projections: Tensor,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    *,
+    config: FDKConfig | None = None,
+    shard: ViewShard | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """Attenuation (..., D, H, W) in 1/mm from line integrals (..., V, rows, cols): filtered back-projection.
+
+    ``f(x) = sum_v db_v (R / depth_v(x))^2 q_v(u, v)`` with q the projection times ``R / sqrt(R^2 + p^2 + zeta^2)`` and
+    the weight of redundant rays, ramp-filtered along p; p, zeta are mm on the virtual detector on the axis of rotation
+    and R the source's distance from it. Views may come in any order, at any angles around the world's z axis, over a
+    full turn or a short scan (180 degrees and the fan angle; Parker weights). Offset detectors (full scans) have their
+    overlap weighted; tilted ones are resampled first.
+
+    Several focal spots (`geometry.sources`) make a volume each, exact in the plane of the spot; at a height between two
+    spots they are mixed linearly, as far as each sees the voxel. So the cone angle stays small over the whole height.
+
+    Args:
+        projections: line integrals; masked pixels must hold a sensible value.
+        geometry: the views; a gantry that does not turn about the world's z axis is brought there by `moved`.
+        grid: the voxels.
+        config: window, extrapolation, how focal spots combine.
+        shard: the share of the views that this process works on, see `ViewShard`; the result is the whole on each.
+        backend: of the back-projection.
+
+    Raises:
+        ValueError: shapes that don't fit, too few angles, values that are not finite, or a grid that no view sees.
+
+    >>> import torch
+    >>> from torchkcreg.geometry import VolumeGrid, circular_geometry
+    >>> geometry = circular_geometry(range(0, 360, 20), sad=404, sdd=538, det_shape=(9, 33), pixel_spacing=(2.0, 2.0))
+    >>> grid = VolumeGrid.centered((1, 9, 9), 2.0)
+    >>> fdk(torch.zeros(18, 9, 33), geometry, grid).abs().max().item()
+    0.0
+    """
+    config = config or FDKConfig()
+    check_projections(projections, geometry)
+    seen = coverage(geometry, grid)
+    if not bool((seen > 0).any()):
+        raise ValueError("grid lies outside the field of view: no view sees any of its voxels")
+    groups = views_by_source(geometry) if config.combine else [list(range(geometry.num_views))]
+    if len(groups) == 1:
+        return _single_spot(projections, geometry, grid, config, shard, backend)
+    parts = [geometry.select(views) for views in groups]
+    shares = height_shares(parts, grid).to(projections)
+    total = projections.new_zeros(*projections.shape[:-3], *grid.shape)
+    for views, part, share in zip(groups, parts, shares, strict=True):
+        own = shard.within(views) if shard is not None else None
+        volume = _single_spot(projections[..., views, :, :], part, grid, config, own, backend)
+        total += volume.mul_(share)
+    return total
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Weights and filter of the views of one focal spot.
+
+    `weights` (V, cols) hold redundancy, angular step and R^2; `padding` counts columns of zeros put before and after
+    the detector's, and `matrices` are those of the padded detector; `sides` says where truncated rows go on.
+    """
+
+    radii: Tensor
+    columns: Tensor
+    rows: Tensor
+    weights: Tensor
+    matrices: Tensor
+    padding: tuple[int, int]
+    sides: tuple[bool, bool]
+
+
+def _single_spot(
+    projections: Tensor,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    config: FDKConfig,
+    shard: ViewShard | None,
+    backend: str,
+) -> Tensor:
+    """FDK of the views of one focal spot."""
+    sampling = angular_sampling(axial_frame(geometry).angles.cpu())
+    if not is_aligned(axial_frame(geometry), geometry.det_shape):
+        projections, geometry = rectified(projections, geometry)
+    plan = _plan(geometry, sampling, config)
+    views = list(range(geometry.num_views)) if shard is None else shard.views
+    volume = projections.new_zeros(*projections.shape[:-3], *grid.shape)
+    for start in range(0, len(views), BLOCK_VIEWS):
+        block = views[start : start + BLOCK_VIEWS]
+        filtered = _filtered(projections[..., block, :, :], plan, block, config)
+        volume += backproject_weighted(filtered, grid, plan.matrices[block], backend=backend)
+    return volume if shard is None else shard.sum(volume)
+
+
+def _plan(geometry: ConeBeamGeometry, sampling: AngularSampling, config: FDKConfig) -> _Plan:
+    frame = axial_frame(geometry)
+    columns, rows = columns_and_rows(frame, geometry.det_shape)
+    radii = frame.radii[:, None]
+    padding, sides = (0, 0), (config.extrapolate, config.extrapolate)
+    if sampling.full:
+        redundancy = full_scan_weights(columns, radii)
+        if is_offset(columns):
+            # what the ramp spreads beyond the near end counts too, and nothing is cut off there: its weight is 0
+            first, last = -float(columns[0, 0]), float(columns[0, -1])
+            missing = round(abs(abs(first) - abs(last)) / abs(float(columns[0, 1] - columns[0, 0])))
+            near_is_first = abs(first) < abs(last)
+            padding = (missing, 0) if near_is_first else (0, missing)
+            sides = (sides[0] and not near_is_first, sides[1] and near_is_first)
+    else:
+        redundancy = parker_weights(sampling.angles.to(columns), (columns / radii).atan(), sampling.scan_range)
+    weights = redundancy * sampling.steps.to(columns)[:, None] * radii**2
+    matrices = geometry.projection_matrices.clone()
+    matrices[:, 0] += padding[0] * matrices[:, 2]
+    return _Plan(frame.radii, columns, rows, weights, matrices, padding, sides)
+
+
+def _filtered(images: Tensor, plan: _Plan, views: list[int], config: FDKConfig) -> Tensor:
+    """Projections (..., v, rows, cols) weighted, ramp-filtered and padded."""
+    columns = plan.columns[views]
+    radii = plan.radii[views][:, None, None]
+    distance = (radii**2 + columns[:, None] ** 2 + plan.rows[views][:, :, None] ** 2).sqrt()
+    weighted = pad(images * (radii / distance * plan.weights[views][:, None]).to(images), plan.padding)
+    pitches = (columns[:, 1:] - columns[:, :-1]).abs().mean(1)
+    pitch = float(pitches.mean())
+    filtered = filter_rows(weighted, pitch, window=config.window, cutoff=config.cutoff, extrapolate=plan.sides)
+    return filtered * (pitch / pitches)[:, None, None].to(images)  # the ramp scales with one over the pitch
+
+
+def check_projections(projections: Tensor, geometry: ConeBeamGeometry) -> None:
+    """Nothing; ValueError unless projections are finite numbers of the geometry's views and detector."""
+    expected = (geometry.num_views, *geometry.det_shape)
+    if projections.dim() < 3 or tuple(projections.shape[-3:]) != expected:
+        raise ValueError(
+            f"projections must have shape (..., V, rows, cols) = {expected}, got {tuple(projections.shape)}"
+        )
+    if expected[2] < 2:
+        raise ValueError(f"FDK filters along rows and needs at least 2 columns, got {expected[2]}")
+    if not projections.is_floating_point():
+        raise ValueError(f"projections must be floating point, got {projections.dtype}")
+    if not bool(projections.isfinite().all()):
+        bad = int((~projections.isfinite()).sum())
+        raise ValueError(f"projections must be finite, got {bad} values that are not")

@@ -1,0 +1,259 @@
+"""Penalised weighted least squares: ordered subsets, with or without momentum."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from .pwls_config import PWLSConfig
+from .roughness import quadratic_roughness, roughness_curvature, roughness_gradient
+from .sharding import ViewShard
+from .subsets import ordered_subsets
+from .system import System
+
+BLOCK_VIEWS = 16  # projected together outside of subsets, to bound memory
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A reconstructed volume.
+
+    Attributes:
+        volume: attenuation (D, H, W), 1/mm.
+        history: one record an iteration: iteration, subsets, objective (exact where asked for, else None), estimate
+            (the objective with each subset's residual as it was met), change (RMS over the voxels, 1/mm), seconds.
+    """
+
+    volume: Tensor
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+
+class PWLS:
+    """The minimiser of ``1/2 sum_i w_i ([A (s x)]_i - l_i)^2 + beta R(x)`` over volumes x, not negative.
+
+    An iteration goes once through all views, subset by subset. Each subset's step divides the gradient by the curvature
+    of separable parabolas above the objective (Erdogan and Fessler 1999); with momentum the steps start from a point
+    ahead (Nesterov 1983; ordered subsets: Kim, Ramani and Fessler 2015). Ordered subsets circle around the minimum
+    instead of reaching it, so the configuration may let their number fall.
+
+    Args:
+        system: projector, one of the user's own or `VoxelSystem`.
+        line_integrals: l, (V, rows, cols).
+        weights: w, same shape, not negative; see `statistical_weights`.
+        config: iterations, subsets, beta, ...
+        mask: s, (D, H, W) between 0 and 1, the share of each voxel that is unknown; 1 if None. What is masked is filled
+            smoothly by the roughness.
+        initial: start volume (D, H, W); zeros if None.
+        spacing: of the voxels (x, y, z), mm, for the roughness.
+        shard: the share of the views that this process works on.
+
+    Raises:
+        ValueError: shapes that don't fit, numbers that are not finite, negative weights, or none above zero.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        line_integrals: Tensor,
+        weights: Tensor,
+        config: PWLSConfig | None = None,
+        *,
+        mask: Tensor | None = None,
+        initial: Tensor | None = None,
+        spacing: Sequence[float] = (1.0, 1.0, 1.0),
+        shard: ViewShard | None = None,
+    ) -> None:
+        self.system, self.config = system, config or PWLSConfig()
+        self.data, self.weights, self.mask, self.initial = line_integrals, weights, mask, initial
+        self.spacing, self.shard = tuple(spacing), shard
+        self._check(initial)
+        shape = tuple(system.volume_shape)
+        self.volume = line_integrals.new_zeros(shape) if initial is None else initial.to(line_integrals).clone()
+        if self.config.nonnegative:
+            self.volume.clamp_(min=0)
+        self.ahead, self.pace = self.volume.clone(), 1.0
+        self.iteration = 0
+        self.history: list[dict[str, Any]] = []
+        self.curvature = self._curvature()
+
+    def _check(self, initial: Tensor | None) -> None:
+        data, weights, shape = self.data, self.weights, tuple(self.system.volume_shape)
+        if data.dim() != 3 or len(data) != self.system.num_views:
+            raise ValueError(
+                f"line_integrals must have shape ({self.system.num_views}, rows, cols), got {tuple(data.shape)}"
+            )
+        if weights.shape != data.shape:
+            raise ValueError(
+                f"weights must have the line integrals' shape {tuple(data.shape)}, got {tuple(weights.shape)}"
+            )
+        for name, tensor in (("line_integrals", data), ("weights", weights)):
+            if not bool(tensor.isfinite().all()):
+                raise ValueError(
+                    f"{name} must be finite; give pixels without a measurement weight 0 and any finite value"
+                )
+        if bool((weights < 0).any()) or not bool((weights > 0).any()):
+            raise ValueError("weights must not be negative, and some must be above zero")
+        for name, volume in (("mask", self.mask), ("initial", initial)):
+            if volume is not None and (tuple(volume.shape) != shape or not bool(volume.isfinite().all())):
+                raise ValueError(f"{name} must be finite numbers of shape {shape}, got {tuple(volume.shape)}")
+        if self.mask is not None and bool(((self.mask < 0) | (self.mask > 1)).any()):
+            raise ValueError("mask must be between 0 and 1, the share of each voxel that is unknown")
+        self.config.stage(0).check(self.system.num_views)
+
+    def _own(self, views: Sequence[int]) -> list[int]:
+        """Those of the views that this process works on."""
+        if self.shard is None:
+            return list(views)
+        own = set(self.shard.views)
+        return [view for view in views if view in own]
+
+    def _total(self, tensor: Tensor) -> Tensor:
+        return tensor if self.shard is None else self.shard.sum(tensor)
+
+    def _masked(self, volume: Tensor) -> Tensor:
+        return volume if self.mask is None else volume * self.mask
+
+    def _curvature(self) -> Tensor:
+        """``s A' W A s 1 + 2 beta deg``, (D, H, W), positive."""
+        total = torch.zeros_like(self.volume)
+        ones = self._masked(torch.ones_like(self.volume))
+        for views in self._blocks():
+            paths = self.system.project(ones, views)
+            total += self.system.backproject(paths * self.weights[views], views)
+        data = self._masked(self._total(total))
+        if not bool((data > 0).any()):
+            raise ValueError("the volume lies outside the field of view: no ray of any weight crosses it")
+        rough = self.config.beta * roughness_curvature(self.volume, spacing=self.spacing)
+        return (data + rough).clamp_min(1e-6 * float(data.max()))
+
+    def _blocks(self) -> list[list[int]]:
+        views = self._own(range(self.system.num_views))
+        return [views[start : start + BLOCK_VIEWS] for start in range(0, len(views), BLOCK_VIEWS)]
+
+    def objective(self, volume: Tensor | None = None) -> float:
+        """The objective of a volume, of the present one if None; one pass through all views."""
+        volume = self.volume if volume is None else volume
+        misfit = torch.zeros((), dtype=torch.float64, device=volume.device)
+        for views in self._blocks():
+            residual = self.system.project(self._masked(volume), views) - self.data[views]
+            misfit += 0.5 * (self.weights[views] * residual.square()).sum(dtype=torch.float64)
+        return float(self._total(misfit)) + self.config.beta * float(quadratic_roughness(volume, spacing=self.spacing))
+
+    def step(self) -> dict[str, Any]:
+        """One iteration; returns its record."""
+        start, before = time.perf_counter(), self.volume
+        stage = self.config.stage(self.iteration)
+        if self.iteration and stage.subsets != self.config.stage(self.iteration - 1).subsets:
+            self.ahead, self.pace = self.volume.clone(), 1.0  # the momentum of other subsets' errors is none
+        subsets = ordered_subsets(self.system.num_views, stage.subsets, sources=self.system.sources)
+        misfit = sum(self._sub_iteration(v, self.system.num_views / len(v), stage.momentum) for v in subsets)
+        rough = float(quadratic_roughness(self.volume, spacing=self.spacing))
+        self.iteration += 1
+        every = self.config.objective_every
+        record = {
+            "iteration": self.iteration,
+            "subsets": stage.subsets,
+            "objective": self.objective() if every and self.iteration % every == 0 else None,
+            "estimate": misfit + self.config.beta * rough,
+            "change": float((self.volume - before).square().mean().sqrt()),
+            "seconds": time.perf_counter() - start,
+        }
+        self.history.append(record)
+        return record
+
+    def _sub_iteration(self, views: list[int], scale: float, momentum: bool) -> float:
+        """Moves the volume by a subset's step; returns the subset's misfit before."""
+        own, point = self._own(views), self.ahead if momentum else self.volume
+        gradient, misfit = torch.zeros_like(point), torch.zeros((), dtype=torch.float64, device=point.device)
+        if own:
+            residual = self.system.project(self._masked(point), own) - self.data[own]
+            weighted = self.weights[own] * residual
+            misfit += 0.5 * (weighted * residual).sum(dtype=torch.float64)
+            gradient += self.system.backproject(weighted, own)
+        gradient = self._masked(self._total(gradient)).mul_(scale)
+        gradient.add_(roughness_gradient(point, spacing=self.spacing), alpha=self.config.beta)
+        stepped = point - gradient.div_(self.curvature)
+        if self.config.nonnegative:
+            stepped.clamp_(min=0)
+        if momentum:
+            pace = (1 + (1 + 4 * self.pace**2) ** 0.5) / 2
+            self.ahead = torch.lerp(self.volume, stepped, 1 + (self.pace - 1) / pace)
+            self.pace = pace
+        self.volume = stepped
+        return float(self._total(misfit))
+
+    def run(
+        self, callback: Callable[[PWLS, dict[str, Any]], None] | None = None, *, progress: bool | None = False
+    ) -> Reconstruction:
+        """The reconstruction after all iterations that are left.
+
+        Args:
+            callback: called with the solver and the record after each iteration; may keep `state_dict()`.
+            progress: show a tqdm bar; None: on a terminal only.
+        """
+        disable = None if progress is None else not progress
+        with tqdm(total=self.config.iterations, initial=self.iteration, desc="PWLS", disable=disable) as bar:
+            while self.iteration < self.config.iterations:
+                record = self.step()
+                bar.set_postfix(objective=f"{record['objective'] or record['estimate']:.6g}", refresh=False)
+                bar.update()
+                if callback is not None:
+                    callback(self, record)
+        return Reconstruction(self.volume, self.history)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a resumed run needs besides its inputs: tensors and plain data."""
+        return {
+            "volume": self.volume,
+            "ahead": self.ahead,
+            "pace": self.pace,
+            "iteration": self.iteration,
+            "history": list(self.history),
+            "config": self.config.to_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on where `state_dict` was taken, bit by bit.
+
+        Raises:
+            ValueError: the state is of another configuration or volume.
+        """
+        if state["config"] != self.config.to_dict():
+            raise ValueError("the checkpoint was made with another configuration")
+        if tuple(state["volume"].shape) != tuple(self.volume.shape):
+            raise ValueError(
+                f"the checkpoint holds a volume of {tuple(state['volume'].shape)}, not {tuple(self.volume.shape)}"
+            )
+        self.volume, self.ahead = (state[name].to(self.volume).clone() for name in ("volume", "ahead"))
+        self.pace, self.iteration, self.history = state["pace"], state["iteration"], list(state["history"])
+
+
+def pwls(
+    system: System,
+    line_integrals: Tensor,
+    weights: Tensor,
+    config: PWLSConfig | None = None,
+    *,
+    progress: bool | None = False,
+    callback: Callable[[PWLS, dict[str, Any]], None] | None = None,
+    **options: Any,
+) -> Reconstruction:
+    """A PWLS reconstruction in one call; arguments as of `PWLS` and `PWLS.run`.
+
+    >>> from torchkcreg.geometry import VolumeGrid, circular_geometry
+    >>> from torchkcreg.reconstruction import VoxelSystem
+    >>> geometry = circular_geometry(range(0, 180, 30), sad=404, sdd=538, det_shape=(9, 9), pixel_spacing=(2.0, 2.0))
+    >>> system = VoxelSystem(geometry, VolumeGrid.centered((6, 6, 6), 2.0))
+    >>> truth = torch.full((6, 6, 6), 0.02)
+    >>> data = system.project(truth, range(6))
+    >>> result = pwls(system, data, torch.ones_like(data), PWLSConfig(iterations=30, subsets=2, beta=0.0))
+    >>> bool((system.project(result.volume, range(6)) - data).abs().max() < 0.01)
+    True
+    """
+    return PWLS(system, line_integrals, weights, config, **options).run(callback, progress=progress)

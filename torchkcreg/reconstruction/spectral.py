@@ -1,0 +1,163 @@
+"""What the metal leaves of the beam: line integrals of the background behind known components, with beam hardening."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, avg_pool3d
+
+from torchkcreg.physics import Material, Spectrum, calcium_in_water, gaussian_blur, material
+
+NEWTON_STEPS = 8
+LEAST_LINE_INTEGRAL = -0.5
+CLEARLY_ABOVE = 0.1  # as a share of water: more than noise and fatty or muscular tissue do
+
+
+@dataclass(frozen=True)
+class BeamModel:
+    """Energies of the beam, the metals' attenuation at them, and the background's relative to a reference energy.
+
+    The background is taken as one material of changing density, water by default: a line integral b at the reference
+    energy attenuates energy k by ``exp(-r_k b)``.
+
+    Attributes:
+        weights: (K,) shares of the signal, summing to one.
+        attenuation: (M, K) of the metals, 1/mm.
+        background: (K,), r.
+        mineral: (K,), the same ratio for calcium, which hardens the beam more than water.
+        reference_kev: the energy of the reconstructed attenuation; None where the beam counts as monoenergetic.
+        water: attenuation of water there, 1/mm, for CT numbers.
+    """
+
+    weights: Tensor
+    attenuation: Tensor
+    background: Tensor
+    mineral: Tensor
+    reference_kev: float | None
+    water: float
+
+    @classmethod
+    def polyenergetic(
+        cls,
+        metals: Sequence[Material],
+        spectrum: Spectrum,
+        *,
+        background: Material | None = None,
+        reference_kev: float | None = None,
+        num_bins: int = 12,
+    ) -> BeamModel:
+        """The beam of a detected spectrum, reduced to the fewest energies that transmit alike.
+
+        Args:
+            metals: in the order of the path lengths' M; may be empty.
+            spectrum: as detected.
+            background: water if None.
+            reference_kev: the spectrum's mean energy if None.
+            num_bins: the most energies kept.
+        """
+        base = material("water") if background is None else background
+        energy = spectrum.mean_energy if reference_kev is None else float(reference_kev)
+        kept = spectrum.reduced([*metals, base], num_bins)
+        attenuation = [m.attenuation(kept.energies_kev) for m in metals]
+        table = torch.stack(attenuation) if attenuation else torch.zeros(0, len(kept.energies_kev), dtype=torch.float64)
+        ratio = base.attenuation(kept.energies_kev) / base.attenuation((energy,))
+        water, dissolved = material("water"), calcium_in_water(200)
+        calcium = dissolved.attenuation(kept.energies_kev) - water.attenuation(kept.energies_kev)
+        mineral = calcium / (dissolved.attenuation((energy,)) - water.attenuation((energy,)))
+        weights = torch.tensor(kept.weights, dtype=torch.float64)
+        return cls(weights, table, ratio, mineral, energy, float(water.attenuation((energy,))[0]))
+
+    @classmethod
+    def monoenergetic(cls, attenuation: Sequence[float], *, water: float = 0.0205) -> BeamModel:
+        """A beam of one energy, as in Cao et al. 2020: metals of given attenuation in 1/mm."""
+        one = torch.ones(1, dtype=torch.float64)
+        table = torch.tensor(list(attenuation), dtype=torch.float64).reshape(-1, 1)
+        return cls(one, table, one, one, None, water)
+
+
+def behind_metal(path_lengths: Tensor, beam: BeamModel, *, pooling: int = 1, blur_sigma_px: float = 0.0) -> Tensor:
+    """Share of each energy that metals let through, (K, V, rows, cols); sums to the transmission.
+
+    Args:
+        path_lengths: (M, V, rows * pooling, cols * pooling) in mm, on pixels finer than the detector's where pooling is
+            above 1: an average of exponentials is not the exponential of the average.
+        beam: energies and attenuation.
+        pooling: side of the squares of pixels whose transmission is averaged.
+        blur_sigma_px: the system's blur, standard deviation in detector pixels.
+    """
+    if path_lengths.dim() != 4 or len(path_lengths) != len(beam.attenuation):
+        raise ValueError(
+            f"path_lengths must have shape ({len(beam.attenuation)}, V, rows, cols), got {tuple(path_lengths.shape)}"
+        )
+    images = []
+    for energy, weight in enumerate(beam.weights.tolist()):
+        exponent = torch.zeros_like(path_lengths[0])
+        for lengths, attenuation in zip(path_lengths, beam.attenuation[:, energy].tolist(), strict=True):
+            exponent.sub_(lengths, alpha=attenuation)
+        passed = exponent.exp_()
+        if blur_sigma_px > 0:
+            passed = gaussian_blur(passed, blur_sigma_px * pooling)
+        images.append(weight * (passed if pooling == 1 else avg_pool2d(passed[:, None], pooling)[:, 0]))
+    return torch.stack(images)
+
+
+def transmitted_behind(
+    background: Tensor, shares: Tensor, beam: BeamModel, *, mineral: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """``-ln sum_k T_k exp(-r_k b)`` of line integrals b of the background, and its derivative to them.
+
+    Where a part m of b is mineral, energy k sees ``r_k (b - m) + r'_k m`` with r' the mineral's own ratio.
+
+    Args:
+        background: b, (V, rows, cols).
+        shares: T, (K, V, rows, cols), from `behind_metal`; or (K,), the beam's own weights, where there is no metal.
+        beam: energies.
+        mineral: m, (V, rows, cols); none if not given.
+    """
+    logs = shares.clamp_min(1e-30).log().to(background)
+    parts = []
+    for k, (ratio, other) in enumerate(zip(beam.background.tolist(), beam.mineral.tolist(), strict=True)):
+        part = logs[k] - ratio * background
+        parts.append(part if mineral is None else part.sub_(mineral, alpha=other - ratio))
+    stacked = torch.stack(parts)
+    total = torch.logsumexp(stacked, dim=0)
+    mixture = torch.exp(stacked.sub_(total))
+    slope = torch.einsum("k...,k->...", mixture, beam.background.to(mixture))
+    return -total, slope
+
+
+def background_line_integrals(
+    line_integrals: Tensor, shares: Tensor, beam: BeamModel, *, mineral: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Line integrals b of the background and the derivative of the measured ones to them, both (V, rows, cols).
+
+    Solves ``-ln sum_k T_k exp(-r_k b) = y`` by Newton's method: the left side is concave and rising in b, so the
+    iteration converges from below.
+
+    Args:
+        line_integrals: y, measured, without scatter, (V, rows, cols).
+        shares: as in `transmitted_behind`.
+        beam: energies.
+        mineral: as in `transmitted_behind`, from `mineral_part` of an earlier reconstruction.
+    """
+    b, slope = torch.zeros_like(line_integrals), torch.ones_like(line_integrals)
+    for _ in range(NEWTON_STEPS if len(beam.weights) > 1 else 1):
+        modelled, slope = transmitted_behind(b, shares, beam, mineral=mineral)
+        b = (b + (line_integrals - modelled) / slope).clamp_min(LEAST_LINE_INTEGRAL)
+    return b, slope
+
+
+def mineral_part(volume: Tensor, beam: BeamModel, *, mask: Tensor | None = None) -> Tensor:
+    """What of a reconstructed background (D, H, W) is mineral, in 1/mm: all above water, where it is clearly above.
+
+    Args:
+        volume: attenuation at the beam's reference energy.
+        beam: knows water there.
+        mask: share of each voxel that is background; 1 if None.
+    """
+    smooth = avg_pool3d(volume[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]
+    excess = (volume - beam.water).clamp_min(0) * (smooth > (1 + CLEARLY_ABOVE) * beam.water)
+    return excess if mask is None else excess * mask

@@ -1,0 +1,159 @@
+"""Iterative reconstruction from measured transmissions in passes: each knows more of scatter and hardening."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+
+from .corrections import Veil, refined_scatter, veil_image
+from .known_component import KnownComponent, component_shares, unknown_share
+from .preparation import PreparedData, prepare
+from .pwls import PWLS
+from .pwls_config import PWLSConfig
+from .sharding import ViewShard
+from .spectral import BeamModel, mineral_part, transmitted_behind
+from .system import VoxelSystem
+
+BLOCK_VIEWS = 20
+
+
+@dataclass(frozen=True)
+class IterativeResult:
+    """A reconstruction from transmissions.
+
+    Attributes:
+        volume: attenuation of the background (D, H, W) at the beam's reference energy, 1/mm; smooth inside metal.
+        mask: share of each voxel that is background; None without components.
+        data: line integrals and weights of the last pass.
+        scatter: in units of the open beam, (V, rows, cols).
+        history: records of the last pass.
+    """
+
+    volume: Tensor
+    mask: Tensor | None
+    data: PreparedData
+    scatter: Tensor
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+
+def reconstruct(
+    transmission: Tensor,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    beam: BeamModel,
+    *,
+    config: PWLSConfig | None = None,
+    components: Sequence[KnownComponent] = (),
+    scatter: Veil | Tensor | None = None,
+    mask: Tensor | None = None,
+    passes: int = 2,
+    initial: Tensor | None = None,
+    blur_sigma_px: float = 0.0,
+    shard: ViewShard | None = None,
+    backend: str = "auto",
+    callback: Callable[[int, PWLS, dict[str, Any]], None] | None = None,
+    state: dict[str, Any] | None = None,
+    progress: bool | None = False,
+) -> IterativeResult:
+    """PWLS of transmissions, with known components KC-Rec: ``mu_total = s mu + mu_implant``.
+
+    The first pass takes the background for water as far as beam hardening goes. Each later one knows from the last
+    volume what of a ray is mineral and, behind known metal, how much of the signal must be scatter.
+
+    Args:
+        transmission: measured intensity over the open beam's, (V, rows, cols).
+        geometry: the views.
+        grid: the voxels.
+        beam: energies, and the attenuation of the components' materials.
+        config: of each pass.
+        components: metal in its registered place; none: plain PWLS.
+        scatter: see `prepare`.
+        mask: 0 where a pixel holds no measurement.
+        passes: how many; 1 keeps the first estimates.
+        initial: start volume of the first pass.
+        blur_sigma_px: the system's blur, detector pixels.
+        shard: the share of the views that this process works on.
+        backend: of the projectors.
+        callback: called with the pass, the solver and the record after each iteration.
+        state: where an earlier run stopped: "pass", "solver" (its state dict) and "volume", that of the pass before.
+        progress: see `PWLS.run`.
+    """
+    if passes < 1:
+        raise ValueError(f"passes must be at least 1, got {passes}")
+    system = VoxelSystem(geometry, grid, backend=backend)
+    unknown = unknown_share(components, grid).to(transmission) if components else None
+    if isinstance(scatter, Veil):
+        scatter = veil_image(transmission, scatter, geometry.pixel_spacing)
+    scatter = torch.zeros_like(transmission) if scatter is None else scatter
+    first = scatter
+    shares = list(
+        component_shares(components, geometry, beam, blur_sigma_px=blur_sigma_px, backend=backend)
+    )  # the same in all passes
+    volume, start, done = initial, 0, None
+    if state is not None:
+        start, volume = int(state["pass"]), state["volume"]
+    for index in range(start, passes):
+        mineral = None
+        if index > 0 and volume is not None:
+            mineral = _projected(system, mineral_part(volume, beam, mask=unknown))
+            if components:
+                visible = volume if unknown is None else volume * unknown
+                seen = _projected(system, visible)
+                scatter = _refined(transmission, first, seen, mineral, shares, beam, geometry.pixel_spacing)
+        data = prepare(
+            transmission,
+            geometry,
+            beam,
+            shares=shares,
+            scatter=scatter,
+            mask=mask,
+            mineral=mineral,
+        )
+        solver = PWLS(
+            system,
+            data.line_integrals,
+            data.weights,
+            config,
+            mask=unknown,
+            initial=volume,
+            spacing=grid.spacing,
+            shard=shard,
+        )
+        if state is not None and index == start and state.get("solver") is not None:
+            solver.load_state_dict(state["solver"])
+        notify = None if callback is None else (lambda s, r, i=index: callback(i, s, r))
+        volume = solver.run(notify, progress=progress).volume
+        done = IterativeResult(volume, unknown, data, scatter, solver.history)
+    if done is None:
+        raise ValueError(f"the state is of pass {start}, but there are only {passes}")
+    return done
+
+
+def _projected(system: VoxelSystem, volume: Tensor) -> Tensor:
+    views = range(system.num_views)
+    blocks = [views[start : start + BLOCK_VIEWS] for start in range(0, len(views), BLOCK_VIEWS)]
+    return torch.cat([system.project(volume, block) for block in blocks])
+
+
+def _refined(
+    transmission: Tensor,
+    scatter: Tensor,
+    background: Tensor,
+    mineral: Tensor,
+    shares: Sequence[tuple[slice, Tensor]],
+    beam: BeamModel,
+    pixel_spacing: Sequence[float],
+) -> Tensor:
+    refined = scatter.clone()
+    for block, share in shares:
+        share = share.to(transmission)
+        line_integrals, _ = transmitted_behind(background[block], share, beam, mineral=mineral[block])
+        primary = torch.exp(-line_integrals)
+        refined[block] = refined_scatter(transmission[block], scatter[block], primary, share.sum(0), pixel_spacing)
+    return refined
