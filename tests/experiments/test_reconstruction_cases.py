@@ -78,10 +78,12 @@ def test_knowing_the_implant_cleans_the_water_bath(tmp_path):
     def measured(name, region):
         return region_statistics(volumes[name], region, reference=volumes["truth"])
 
-    for material in ("water", "ca50", "ca200"):
-        kcrec = abs(measured("kcrec", found[material]).mean_error)
-        assert kcrec < 0.5 * abs(measured("pwls", found[material]).mean_error)
-        assert kcrec < abs(measured("fdk", found[material]).mean_error) / 3
-    close = found["water"] & near
-    assert measured("kcrec", close).std < 0.5 * measured("pwls", close).std
-    assert measured("kcrec", close).std < measured("fdk", close).std / 3
+    for material, region in found.items():
+        assert abs(measured("kcrec", region).mean_error) < abs(measured("fdk", region).mean_error) / 3
+        assert abs(measured("kcrec", region).mean_error) < 0.01 * measured("truth", region).mean
+        if material in ("water", "ca50"):  # in the other two the errors of plain PWLS cancel
+            assert abs(measured("kcrec", region).mean_error) < 0.5 * abs(measured("pwls", region).mean_error)
+    for material in ("water", "ca100"):  # those that come near the metal
+        close = found[material] & near
+        assert measured("kcrec", close).std < (0.5 if material == "water" else 0.7) * measured("pwls", close).std
+        assert measured("kcrec", close).std < measured("fdk", close).std / 3

@@ -140,3 +140,12 @@ def test_what_does_not_fit_is_named():
     with pytest.raises(ValueError, match=r"cover 120\.0 degrees"):
         short = circular_geometry(range(0, 120, 2), **PANEL)
         fdk(torch.zeros(60, 44, 56), short, GRID)
+
+
+def test_a_height_that_one_spot_does_not_see_comes_from_the_one_that_does(line_integrals_of):
+    scanner = MultisourceScanner(det_shape=(40, 32), det_size_mm=(80, 128))  # T2 sees up to 30 mm, T1 from 0 to 60
+    geometry = scanner.geometry()
+    axis = torch.tensor([0.0, 0.0, 300.0])
+    images = line_integrals_of([(Cylinder(-axis, axis, 20.0), 0.02)], geometry)
+    volume = fdk(images, geometry, VolumeGrid.centered((3, 5, 5), 2.5, center=(0, 0, 40)))
+    assert volume.mean() == pytest.approx(0.02, rel=0.02)

@@ -15,6 +15,7 @@ from torchkcreg.deformation import (
 from torchkcreg.geometry import circular_geometry, rigid_matrix, rotation_from_vector
 from torchkcreg.implant import Component, ImplantPointCloud
 from torchkcreg.registration import RegistrationConfig, RegistrationData, Scene, Stage, StageModel, build_scene
+from torchkcreg.simulation import locking_plate
 
 SCREW = Component.screw("screw", (2.0, 2.0, 15.0), (2.0, -14.0, 15.0), 1.5, pitch=0.5)
 COARSE = {"optimizer": "cmaes", "iterations": 40, "tolerance": 0.1, "step_mm": 2.0, "population": 12}
@@ -78,3 +79,11 @@ def bend(of: Scene, radians: float) -> None:
     with torch.no_grad():
         of.deformation.control_points.copy_(control_points_from_groups(grid, labels, *motions))
         of.deformation.labels.copy_(labels)
+
+
+GRID_OF_SCREWS = {"grid_shape": (4, 4, 8), "grid_spacing_mm": (8.0, 8.0, 10.0), "pitch_mm": 0.5}
+
+
+def drilled_plate() -> trimesh.Trimesh:
+    """A plate of 53 x 10 x 3 mm with three holes, at z = -15, 0 and 15 mm."""
+    return locking_plate(length=53.0, width=10.0, thickness=3.0, num_holes=3, hole_radius=2.0)

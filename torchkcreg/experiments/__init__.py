@@ -5,9 +5,9 @@ from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.describe import describe, describe_installation
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
-from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
 from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
 from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles, ReconstructionOptions
+from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
 from torchkcreg.experiments.registered_components import registered_components
 
 __all__ = [

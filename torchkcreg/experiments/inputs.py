@@ -12,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.implant import Component, ImplantPointCloud
+from torchkcreg.implant import Component, Hole, ImplantPointCloud, find_holes
 from torchkcreg.io import (
     read_components,
     read_geometry,
@@ -64,6 +64,7 @@ class RegistrationInputs:
         implant: Nodes of the undeformed implant.
         data: Projections and geometry of the views to use.
         components: Screws and the like.
+        holes: Round holes of the implant.
         spectrum: Detected spectrum, where one was given.
         implant_to_world: Start pose (4, 4), where one was given.
         warnings: What a user should know about them, a line each.
@@ -72,6 +73,7 @@ class RegistrationInputs:
     implant: ImplantPointCloud
     data: RegistrationData
     components: list[Component]
+    holes: list[Hole]
     spectrum: Spectrum | None
     implant_to_world: Tensor | None
     warnings: list[str]
@@ -96,7 +98,8 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
             Component.screw(c.name, c.start, c.end, c.radius, material=c.material, pitch=config.pitch_mm) for c in specs
         ]
         implant = ImplantPointCloud.from_mesh(mesh, config.pitch_mm)
-    return RegistrationInputs(implant, data, components, spectrum, pose, notes)
+        holes = find_holes(mesh)
+    return RegistrationInputs(implant, data, components, holes, spectrum, pose, notes)
 
 
 def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:

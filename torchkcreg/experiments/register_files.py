@@ -84,6 +84,7 @@ def register_files(
         spectrum=inputs.spectrum,
         components=inputs.components,
         implant_to_world=inputs.implant_to_world,
+        holes=inputs.holes,
     )
     initial = scene.implant_to_world.clone()
     trainer = Trainer(scene, inputs.data, config, callbacks=[ProgressBar()])
@@ -145,6 +146,7 @@ def _metrics(result: RegistrationResult, scene: Scene, initial: Tensor, seconds:
         "mean_motion_mm": float(motion.mean()),
         "largest_motion_mm": float(motion.max()),
         "intensity": result.intensity,
+        "screws_found": result.screws,
         "seconds": seconds,
         "warnings": result.warnings,
     }

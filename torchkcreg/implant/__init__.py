@@ -2,6 +2,7 @@
 
 from torchkcreg.implant.closed_mesh import closed_triangles
 from torchkcreg.implant.components import Component, cylinder_cloud, cylinder_mesh
+from torchkcreg.implant.holes import Hole, find_holes
 from torchkcreg.implant.morton import morton_order
 from torchkcreg.implant.partial_volumes import FilledCells, fill_cells
 from torchkcreg.implant.point_cloud import ImplantPointCloud
@@ -10,11 +11,13 @@ from torchkcreg.implant.voxelize import voxelize_mesh, voxelize_points
 __all__ = [
     "Component",
     "FilledCells",
+    "Hole",
     "ImplantPointCloud",
     "closed_triangles",
     "cylinder_cloud",
     "cylinder_mesh",
     "fill_cells",
+    "find_holes",
     "morton_order",
     "voxelize_mesh",
     "voxelize_points",

@@ -45,6 +45,7 @@ def result_to_dict(result: RegistrationResult) -> dict[str, Any]:
             "control_points_mm": deformation.control_points,
             "labels": deformation.labels,
             "components": result.components,
+            "screws_found": result.screws,
             "intensity": result.intensity,
             "gc": result.gc,
             "seed": result.seed,
@@ -86,6 +87,7 @@ def result_from_dict(content: Any, *, history: list[dict[str, Any]] | None = Non
             name: finite_array(motion, (4, 4), f"motion of component {name}")
             for name, motion in content.get("components", {}).items()
         },
+        screws=list(content.get("screws_found", [])),
         intensity={
             name: finite_number(value, f"intensity parameter {name}")
             for name, value in content.get("intensity", {}).items()

@@ -9,6 +9,7 @@ from .objective import StageObjective
 from .register import build_scene, register
 from .result import RegistrationResult
 from .scene import Scene
+from .screws import find_screws
 from .trainer import Trainer, stage_objective
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Trainer",
     "build_scene",
     "estimate_background",
+    "find_screws",
     "preset_stages",
     "register",
     "stage_objective",

@@ -31,8 +31,11 @@ class Stage(BaseModel):
         margin_mm: What is seen around the implant's projection, mm at the detector; None: the whole detector.
         background: Before the stage, what the model lacks (bone, water) is estimated as a smooth path length, and DRRs
             include it.
+        screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
+            or those found before have their lengths and radius estimated along ("fit").
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
-        estimate: Parameters of the intensity model that are estimated along.
+        estimate: Parameters of the intensity model that are estimated along; hardness only where the spectrum was not
+            given.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -49,6 +52,7 @@ class Stage(BaseModel):
     population: int = Field(40, ge=4)
     margin_mm: float | None = Field(6.0, ge=0)
     background: bool = False
+    screws: Literal["find", "fit"] | None = None
     robust: bool = False
     estimate: tuple[NuisanceName, ...] = ()
 
@@ -75,11 +79,21 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
     )
     physics: tuple[NuisanceName, ...] = ("scatter", "blur")
     levels = [
-        Stage(bin=4, pitch_factor=2),
-        Stage(groups=2, bin=4, pitch_factor=2),
-        Stage(groups=2, bin=2, pitch_factor=2, estimate=physics),
-        Stage(groups=20, modes=40, bin=2, pitch_factor=2, estimate=physics, background=True),
-        Stage(groups=20, modes=40, bin=1, pitch_factor=2, estimate=physics, background=True, robust=True),
+        Stage(bin=8, pitch_factor=4, screws="find"),
+        Stage(bin=4, pitch_factor=2, screws="find"),
+        Stage(groups=2, bin=4, pitch_factor=2, screws="find"),
+        Stage(groups=2, bin=2, pitch_factor=2, estimate=physics, screws="fit"),
+        Stage(groups=20, modes=40, bin=2, pitch_factor=2, estimate=physics, background=True, screws="fit"),
+        Stage(
+            groups=20,
+            modes=40,
+            bin=1,
+            pitch_factor=2,
+            estimate=physics,
+            background=True,
+            robust=True,
+            screws="fit",
+        ),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
@@ -93,7 +107,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
             ),
         ]
     if preset == "adam":
-        steps = (0.1, 0.05, 0.05, 0.02, 0.02)
+        steps = (0.2, 0.1, 0.05, 0.05, 0.02, 0.02)
         descend = {"optimizer": "adam", "iterations": 120}
         levels = [s.model_copy(update={**descend, "step_mm": step}) for s, step in zip(levels, steps, strict=True)]
     return (start, *levels)

@@ -16,10 +16,12 @@ from torchkcreg.projector import cell_footprint, project_points
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
 from .elasticity import Elasticity, ModalMotion
+from .found_screw import FoundScrew, ScrewShapes
 from .motion import GroupMotion
 from .nuisance import Nuisance
 from .scene import Scene
 
+_SCREW_PITCH_MM = 0.5
 _SOLID_PITCH_FACTOR = 8  # bending is smooth: its energy needs few nodes
 
 
@@ -68,11 +70,16 @@ class StageModel:
             )
         self.scene, self.stage, self.config = scene, stage, config
         self.implant = _coarsened(scene.implant, stage.pitch_factor)
+        self.screws: ScrewShapes | None = None
         self._prepare_motion()
         self._prepare_clouds()
         self._prepare_images(data)
-        self.nuisance = Nuisance(scene.intensity, stage.estimate, stage.bin / stage.oversampling)
-        self.num_parameters = self.motion.num_parameters + self.nuisance.num_parameters
+        estimate = [name for name in stage.estimate if name != "hardness" or not scene.knows_spectrum]
+        self.nuisance = Nuisance(scene.intensity, estimate, stage.bin / stage.oversampling)
+        if scene.found and stage.screws == "fit":
+            self.screws = ScrewShapes(scene.found, self.screw_path)
+        shapes = self.screws.num_parameters if self.screws else 0
+        self.num_parameters = self.motion.num_parameters + self.nuisance.num_parameters + shapes
 
     def _prepare_motion(self) -> None:
         grid = self.scene.deformation.grid
@@ -135,13 +142,21 @@ class StageModel:
         """The candidate (1, D) that leaves the scene as it is."""
         return torch.zeros(1, self.num_parameters, dtype=torch.float64)
 
-    def split(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Parameters (..., D) of the motion and of the intensity model."""
-        return parameters[..., : self.motion.num_parameters], parameters[..., self.motion.num_parameters :]
+    def split(self, parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Parameters (..., D) of the motion, of the intensity model and of the shapes of found screws."""
+        motion, physics = self.motion.num_parameters, self.nuisance.num_parameters
+        return parameters.split([motion, physics, self.num_parameters - motion - physics], dim=-1)
+
+    def clamped(self, parameters: Tensor) -> Tensor:
+        """Parameters (K, D), all within their bounds."""
+        motion, physics, shapes = self.split(parameters)
+        if self.screws:
+            shapes = self.screws.clamp(shapes)
+        return torch.cat([motion, self.nuisance.clamp(physics), shapes], dim=-1)
 
     def motion_steps(self, parameters: Tensor) -> Tensor:
         """Motions (K, 4 G, 3) of the groups in the grid's axes, as the moments multiply them: t_g, then R_g - I."""
-        return self.motion.steps(self.split(parameters)[0])
+        return self.motion.steps(parameters[..., : self.motion.num_parameters])
 
     def world_points(self, parameters: Tensor) -> list[Tensor]:
         """World positions (K, N_m, 3) of the nodes of each material."""
@@ -170,17 +185,35 @@ class StageModel:
                 self.world_points(parameters), self.clouds, self.footprints, strict=True
             )
         ]
+        if self.screws:
+            paths[0] = paths[0] + self.screws(self.split(parameters)[2])
         if self.scene.is_polyenergetic:
             unknown = torch.zeros(()) if self.background is None else self.background
             paths.append(unknown.expand_as(paths[0]))
         return torch.stack(paths, dim=-4)
 
+    @torch.no_grad()
+    def screw_path(self, screw: FoundScrew) -> Tensor:
+        """Path lengths (V, rows, cols) of a screw of the implant's material where the scene has it, mm."""
+        component = screw.component("screw", self.scene.material, _SCREW_PITCH_MM)
+        motion = self.scene.implant_to_world @ self.scene.motion_of(component)
+        points = transform_points(motion, component.cloud.points.double()).float()
+        cell = component.cloud.cell.float() @ motion[:3, :3].float().T
+        footprint = cell_footprint(points, cell, self.matrices)
+        masses, backend = component.cloud.masses.float(), self.config.backend
+        return project_points(points, masses, self.matrices, self.det_shape, footprint=footprint, backend=backend)
+
+    def intensity_options(self, parameters: Tensor) -> dict[str, Tensor]:
+        """Keyword arguments of the intensity model for candidates (K, D)."""
+        options = self.nuisance(self.split(parameters)[1])
+        if self.data.scatter_shape is not None and self.scene.is_polyenergetic:
+            options["scatter_shape"] = self.data.scatter_shape
+        return options
+
     def line_integrals(self, parameters: Tensor) -> Tensor:
         """DRRs (K, V, rows, cols) of candidates (K, D)."""
-        physics = self.nuisance(self.split(parameters)[1])
-        if self.data.scatter_shape is not None and self.scene.is_polyenergetic:
-            physics["scatter_shape"] = self.data.scatter_shape
-        return self.scene.intensity(self.path_lengths(parameters), pooling=self.stage.oversampling, **physics)
+        paths, options = self.path_lengths(parameters), self.intensity_options(parameters)
+        return self.scene.intensity(paths, pooling=self.stage.oversampling, **options)
 
 
 def _resized(images: Tensor | None, size: tuple[int, int]) -> Tensor | None:

@@ -65,9 +65,8 @@ class StageObjective:
         self.similarity = GradientCorrelation(model.data.line_integrals, model.data.mask, weights)
 
     def project(self, parameters: Tensor) -> Tensor:
-        """Candidates with the intensity model's parameters inside their bounds."""
-        motion, physics = self.model.split(parameters)
-        return torch.cat([motion, self.model.nuisance.clamp(physics)], dim=-1)
+        """Candidates with the parameters of intensity model and screws inside their bounds."""
+        return self.model.clamped(parameters)
 
     def gradient_correlations(self, parameters: Tensor) -> Tensor:
         """GC (K, V) of each candidate and view."""
@@ -112,4 +111,7 @@ class StageObjective:
         deformation.labels.copy_(self.model.labels)
         common = deformation.remove_common_rigid(self.model.weights)
         self.scene.implant_to_world.copy_(self.scene.implant_to_world @ common.double())
-        self.model.nuisance.accept(self.model.split(parameters)[1])
+        _, physics, shapes = self.model.split(parameters)
+        self.model.nuisance.accept(physics)
+        if self.model.screws:
+            self.scene.place(self.model.screws.stepped(shapes), self.config.pitch_mm)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchkcreg.deformation import FreeFormDeformation, default_grid
-from torchkcreg.implant import Component, ImplantPointCloud
+from torchkcreg.implant import Component, Hole, ImplantPointCloud
 from torchkcreg.physics import IdentityIntensity, PolyenergeticTransmission, Spectrum, material, tungsten_spectrum
 
 from .callbacks import Callback
@@ -26,6 +26,7 @@ def build_scene(
     spectrum: Spectrum | None = None,
     components: Sequence[Component] = (),
     implant_to_world: Tensor | None = None,
+    holes: Sequence[Hole] = (),
 ) -> Scene:
     """The scene of a registration at its start pose.
 
@@ -35,6 +36,7 @@ def build_scene(
         spectrum: Detected spectrum; a 90 kV tungsten spectrum when None.
         components: Screws and the like in the implant's frame.
         implant_to_world: Approximate pose (4, 4); the identity when None.
+        holes: The implant's holes, where screws are looked for if no components are given.
     """
     grid = default_grid(implant.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
     pose = torch.eye(4, dtype=torch.float64) if implant_to_world is None else implant_to_world
@@ -56,6 +58,8 @@ def build_scene(
         components=components,
         material=name,
         follow_radius_mm=config.follow_radius_mm,
+        holes=() if components else holes,
+        knows_spectrum=spectrum is not None,
     )
 
 
@@ -67,6 +71,7 @@ def register(
     spectrum: Spectrum | None = None,
     components: Sequence[Component] = (),
     implant_to_world: Tensor | None = None,
+    holes: Sequence[Hole] = (),
     callbacks: Sequence[Callback] = (),
 ) -> RegistrationResult:
     """The deformation of an implant, measured in a few projections (FFD-KC-Reg, Cao et al. 2020).
@@ -78,8 +83,17 @@ def register(
         spectrum: Detected spectrum; a 90 kV tungsten spectrum when None.
         components: Screws and the like, in the implant's frame; each follows the implant near its head.
         implant_to_world: Approximate pose (4, 4); the identity when None.
+        holes: The implant's holes, see :func:`torchkcreg.implant.find_holes`: where no components are given, screws are
+            looked for in them.
         callbacks: See :class:`torchkcreg.registration.Callback`.
     """
     config = config or RegistrationConfig()
-    scene = build_scene(implant, config, spectrum=spectrum, components=components, implant_to_world=implant_to_world)
+    scene = build_scene(
+        implant,
+        config,
+        spectrum=spectrum,
+        components=components,
+        implant_to_world=implant_to_world,
+        holes=holes,
+    )
     return Trainer(scene, data, config, callbacks=callbacks).fit()

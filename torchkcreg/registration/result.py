@@ -27,6 +27,7 @@ class RegistrationResult:
         seed: Seed of the random numbers.
         warnings: What a user should know before trusting the numbers.
         components: Rigid motion (4, 4) of each component in the implant's frame.
+        screws: Screws that were found: start, end and radius in the implant's frame before the motion, mm.
         intensity: Estimated parameters of the intensity model.
     """
 
@@ -38,6 +39,7 @@ class RegistrationResult:
     seed: int = 0
     warnings: list[str] = field(default_factory=list)
     components: dict[str, Tensor] = field(default_factory=dict)
+    screws: list[dict[str, Any]] = field(default_factory=list)
     intensity: dict[str, float] = field(default_factory=dict)
 
     @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import torch
@@ -9,7 +10,9 @@ from torch import Tensor, nn
 
 from torchkcreg.deformation import FreeFormDeformation
 from torchkcreg.geometry import fit_rigid
-from torchkcreg.implant import Component, ImplantPointCloud
+from torchkcreg.implant import Component, Hole, ImplantPointCloud
+
+from .found_screw import FoundScrew
 
 
 class Scene(nn.Module):
@@ -26,6 +29,8 @@ class Scene(nn.Module):
         components: Screws and the like, in the implant's frame.
         material: The implant's material; components of the same material share its path length.
         follow_radius_mm: How near to a component's head the implant's nodes tell its motion, mm.
+        holes: The implant's holes, where screws that are not among the components may sit.
+        knows_spectrum: Whether the intensity model's spectrum is the scanner's own, not a likely one.
     """
 
     implant_to_world: Tensor
@@ -40,15 +45,42 @@ class Scene(nn.Module):
         components: Sequence[Component] = (),
         material: str = "implant",
         follow_radius_mm: float = 8.0,
+        holes: Sequence[Hole] = (),
+        knows_spectrum: bool = True,
     ) -> None:
         super().__init__()
         self.implant = implant
         self.deformation = deformation
         self.intensity = intensity
-        self.components = list(components)
         self.material = material
+        self.follow_radius_mm = follow_radius_mm
+        self.holes = list(holes)
+        self.knows_spectrum = knows_spectrum
         self.register_buffer("implant_to_world", implant_to_world.double().clone())
-        self.followed = [followed_points(implant.points, c.head, follow_radius_mm) for c in self.components]
+        self.found: list[FoundScrew] = []
+        self._set_components(components)
+
+    def place(self, screws: Sequence[FoundScrew], pitch: float) -> None:
+        """Makes screws of the implant's material, nodes ``pitch`` mm apart, the only components."""
+        self.found = list(screws)
+        names = [f"found{index}" for index in range(len(screws))]
+        self._set_components([s.component(n, self.material, pitch) for n, s in zip(names, screws, strict=True)])
+
+    def _set_components(self, components: Sequence[Component]) -> None:
+        self.components = list(components)
+        self.followed = [followed_points(self.implant.points, c.head, self.follow_radius_mm) for c in self.components]
+
+    def without_components(self) -> Scene:
+        """The implant alone, sharing everything with this scene."""
+        bare = copy.copy(self)
+        bare.components, bare.followed, bare.found = [], [], []
+        return bare
+
+    @torch.no_grad()
+    def motion_of(self, component: Component) -> Tensor:
+        """Rigid motion (4, 4) of a component in the implant's frame, whether it is one of the scene's or not."""
+        points = followed_points(self.implant.points, component.head, self.follow_radius_mm).double()
+        return fit_rigid(points, points + self.deformation.displacement(points))
 
     @property
     def materials(self) -> list[str]:
@@ -68,11 +100,7 @@ class Scene(nn.Module):
     @torch.no_grad()
     def component_motions(self) -> dict[str, Tensor]:
         """Rigid motion (4, 4) of each component in the implant's frame."""
-        motions = {}
-        for component, points in zip(self.components, self.followed, strict=True):
-            points = points.double()
-            motions[component.name] = fit_rigid(points, points + self.deformation.displacement(points))
-        return motions
+        return {component.name: self.motion_of(component) for component in self.components}
 
 
 def followed_points(points: Tensor, head: Tensor, radius: float, at_most: int = 200) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -15,19 +15,27 @@ from .background import estimate_background
 from .callbacks import Callback
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
+from .found_screw import FoundScrew
 from .objective import StageObjective
 from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
+from .screws import find_screws
 
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
     """The objective of a stage at the scene's present state, with the background that the stage asks for."""
-    if scene.is_polyenergetic and data.scatter_shape is None:
-        data = data.with_scatter_shape(config.scatter_mm)
+    data = with_scatter_shape(scene, data, config)
     if stage.background and scene.is_polyenergetic:
         data = replace(data, background=estimate_background(scene, data, config))
     return StageObjective(scene, data, stage, config)
+
+
+def with_scatter_shape(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
+    """The data with a shape of the scatter, where the intensity model has scatter."""
+    if not scene.is_polyenergetic or data.scatter_shape is not None:
+        return data
+    return data.with_scatter_shape(config.scatter_mm)
 
 
 class Trainer:
@@ -66,6 +74,7 @@ class Trainer:
         stage, start = self.stages[index], time.perf_counter()
         for callback in self.callbacks:
             callback.on_stage_start(self, index, stage)
+        self._look_for_screws(stage)
         objective = stage_objective(self.scene, self.data, stage, self.config)
 
         def report(progress: Progress) -> None:
@@ -79,6 +88,12 @@ class Trainer:
         self.next_stage = index + 1
         for callback in self.callbacks:
             callback.on_stage_end(self, index, stage)
+
+    def _look_for_screws(self, stage: Stage) -> None:
+        if stage.screws != "find" or not self.scene.holes:
+            return
+        data = with_scatter_shape(self.scene, self.data, self.config)
+        self.scene.place(find_screws(self.scene, data, self.config, bin=stage.bin), self.config.pitch_mm)
 
     def _result(self) -> RegistrationResult:
         scene = self.scene
@@ -95,12 +110,18 @@ class Trainer:
             seed=self.config.seed,
             components=scene.component_motions(),
             intensity=intensity,
+            screws=[asdict(screw) for screw in self.scene.found],
         )
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain types that :meth:`load_state_dict` continues from."""
         scene = {name: value for name, value in self.scene.state_dict().items() if not name.startswith("implant.")}
-        return {"scene": scene, "next_stage": self.next_stage, "history": self.history}
+        return {
+            "scene": scene,
+            "next_stage": self.next_stage,
+            "history": self.history,
+            "screws": [asdict(screw) for screw in self.scene.found],
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a checkpoint of the same scene and configuration.
@@ -113,4 +134,6 @@ class Trainer:
         if unknown:
             raise ValueError(f"the checkpoint does not fit this registration: {', '.join(unknown)} differ")
         self.scene.load_state_dict(state["scene"], strict=False)
+        if self.scene.holes:
+            self.scene.place([FoundScrew(**screw) for screw in state["screws"]], self.config.pitch_mm)
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])

@@ -1,0 +1,76 @@
+"""Screws that are found in an implant's holes, and their shapes that are estimated along."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from small_scene import GRID_OF_SCREWS, drilled_plate, image, pose
+
+from torchkcreg.implant import Component, ImplantPointCloud, find_holes
+from torchkcreg.registration import RegistrationConfig, Stage, build_scene, find_screws, register
+from torchkcreg.registration.found_screw import FoundScrew, ScrewShapes
+from torchkcreg.registration.model import StageModel
+
+TRUE = FoundScrew((0.0, 1.5, 15.0), (0.0, -18.0, 15.0), 1.6)
+CONFIG = RegistrationConfig(material="steel", stages=(Stage(oversampling=1),), **GRID_OF_SCREWS)
+
+
+@pytest.fixture(scope="module")
+def mesh() -> trimesh.Trimesh:
+    return drilled_plate()
+
+
+def scene_of(mesh: trimesh.Trimesh, motion: torch.Tensor | None = None, components: tuple[Component, ...] = ()):
+    cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
+    holes = find_holes(mesh)
+    return build_scene(cloud, CONFIG, implant_to_world=motion, components=components, holes=holes)
+
+
+def test_the_one_screw_of_three_holes_is_found_with_its_length_and_radius(mesh: trimesh.Trimesh) -> None:
+    screw = TRUE.component("true", "steel", 0.5)
+    data = image(scene_of(mesh, components=(screw,)), CONFIG)
+    (found,) = find_screws(scene_of(mesh), data, CONFIG, bin=1)
+    assert np.allclose(found.start, TRUE.start, atol=0.3)
+    assert np.allclose(found.end, TRUE.end, atol=1.0)
+    assert found.radius == pytest.approx(TRUE.radius, abs=0.15)
+
+
+def test_no_screw_is_found_where_there_is_none(mesh: trimesh.Trimesh) -> None:
+    data = image(scene_of(mesh), CONFIG)
+    noise = torch.randn(data.line_integrals.shape, generator=torch.Generator().manual_seed(0))
+    noisy = type(data)(data.geometry, data.line_integrals + 0.02 * noise)
+    assert find_screws(scene_of(mesh), noisy, CONFIG, bin=2) == []
+
+
+def test_a_registration_that_is_told_of_no_screw_finds_it_and_its_shape(mesh: trimesh.Trimesh) -> None:
+    motion = pose(0.4, 0.3)
+    data = image(scene_of(mesh, motion, components=(TRUE.component("true", "steel", 0.5),)), CONFIG)
+    stages = (Stage(bin=2, oversampling=1, screws="find"), Stage(oversampling=1, screws="fit", tolerance=1e-4))
+    cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
+    result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
+    (found,) = result.screws
+    assert np.allclose(found["end"], TRUE.end, atol=0.25)
+    points = cloud.points.double()
+    truth = points @ motion[:3, :3].T + motion[:3, 3]
+    assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.05
+
+
+def test_shapes_are_the_slopes_of_the_images(mesh: trimesh.Trimesh) -> None:
+    model = StageModel(scene_of(mesh), image(scene_of(mesh), CONFIG), CONFIG.stages[0], CONFIG)
+    shapes = ScrewShapes([TRUE], model.screw_path)
+    longer = shapes(torch.tensor([[0.4, 0.0]], dtype=torch.float64))[0]
+    (stepped,) = shapes.stepped(torch.tensor([0.4, 0.0], dtype=torch.float64))
+    assert stepped.length == pytest.approx(TRUE.length + 0.4)
+    change = model.screw_path(stepped) - model.screw_path(TRUE)
+    assert float(longer.sum()) == pytest.approx(float(change.sum()), rel=0.03)
+    thicker = shapes(torch.tensor([[0.0, 0.5]], dtype=torch.float64))[0]
+    (stepped,) = shapes.stepped(torch.tensor([0.0, 0.5], dtype=torch.float64))
+    assert stepped.radius == pytest.approx(TRUE.radius + 0.1)
+    change = model.screw_path(stepped) - model.screw_path(TRUE)
+    assert float(thicker.sum()) == pytest.approx(float(change.sum()), rel=0.06)
+
+
+def test_screws_side_by_side_overlap_and_others_do_not() -> None:
+    beside = FoundScrew((0.0, 1.5, 18.0), (0.0, -18.0, 18.0), 1.6)
+    apart = FoundScrew((0.0, 1.5, 19.0), (0.0, -18.0, 19.0), 1.6)
+    assert TRUE.overlaps(TRUE.with_length(5.0)) and TRUE.overlaps(beside) and not TRUE.overlaps(apart)

@@ -1,0 +1,111 @@
+"""Round holes of an implant, where its screws sit, found in its mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import networkx
+import numpy as np
+import trimesh
+
+_STEEPEST_TURN = np.deg2rad(50.0)  # between neighbouring faces of a hole's wall
+_ALONG_AXIS = 0.35  # a wall's normals are at right angles to its axis, but for countersinks
+_OPENING = np.deg2rad(150.0)  # a wall surrounds its screw by more than half: combination holes open into each other
+
+
+@dataclass(frozen=True, eq=False)
+class Hole:
+    """A round hole through an implant or into it.
+
+    Attributes:
+        center: Middle of its axis, (3,), in the mesh's frame, mm.
+        axis: Direction of its axis, (3,), a unit vector; which of the two ways has no meaning.
+        radius: Of its wall where it is narrowest, mm.
+        depth: Length of its wall along the axis, mm.
+    """
+
+    center: np.ndarray
+    axis: np.ndarray
+    radius: float
+    depth: float
+
+
+def find_holes(mesh: trimesh.Trimesh, *, smallest_mm: float = 0.75, largest_mm: float = 5.0) -> list[Hole]:
+    """Round holes whose radius lies between two bounds, in mm, in the order of their position along the implant.
+
+    A hole's wall is a patch of faces that meet at edges bent inwards; the normals of a round one lie in a plane, at
+    right angles to the axis, face every direction, and meet on the axis. Countersinks and threads only add faces that
+    look along it. A combination hole counts as the two round ones that it is made of.
+
+    Example:
+        >>> plate = trimesh.creation.annulus(r_min=2.0, r_max=8.0, height=4.0)
+        >>> [(round(h.radius, 1), round(h.depth, 1)) for h in find_holes(plate)]
+        [(2.0, 4.0)]
+    """
+    merged = trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False)
+    merged.merge_vertices(merge_tex=True, merge_norm=True)
+    turn = merged.face_adjacency_angles
+    inwards = ~merged.face_adjacency_convex & (turn > 1e-6) & (turn < _STEEPEST_TURN)
+    flat = turn <= 1e-6
+    graph = networkx.Graph(merged.face_adjacency[inwards].tolist())
+    curved = np.zeros(len(merged.faces), bool)
+    curved[list(graph.nodes)] = True
+    # the triangles of one flat facet of a wall belong together
+    within = flat & curved[merged.face_adjacency].any(axis=1)
+    graph.add_edges_from(merged.face_adjacency[within].tolist())
+    holes = [_hole_of(merged, np.fromiter(patch, int)) for patch in networkx.connected_components(graph)]
+    found: list[Hole] = []
+    for hole in holes:
+        if hole is not None and smallest_mm <= hole.radius <= largest_mm:
+            found = _joined(found, hole)
+    spread = np.linalg.svd(merged.vertices - merged.vertices.mean(axis=0), full_matrices=False)[2][0]
+    return sorted(found, key=lambda hole: float(hole.center @ spread))
+
+
+def _hole_of(mesh: trimesh.Trimesh, patch: np.ndarray) -> Hole | None:
+    """The hole whose wall is a patch of faces; None if the patch is no wall."""
+    normals, areas = mesh.face_normals[patch], mesh.area_faces[patch]
+    axis = np.linalg.eigh((normals * areas[:, None]).T @ normals)[1][:, 0]
+    wall = np.abs(normals @ axis) < _ALONG_AXIS
+    if wall.sum() < 5:
+        return None
+    patch, normals, areas = patch[wall], normals[wall], areas[wall]
+    centers = mesh.triangles_center[patch]
+    across = normals - np.outer(normals @ axis, axis)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    # the point whose distances to the walls' planes spread least: p.n - c.n = -radius
+    system = np.column_stack([across, np.ones(len(across))]) * np.sqrt(areas)[:, None]
+    system = np.vstack([system, np.append(axis, 0.0) * np.sqrt(areas.sum())])
+    middle = np.median(mesh.vertices[mesh.faces[patch]].reshape(-1, 3) @ axis)
+    heights = np.einsum("ij,ij->i", centers, across)
+    target = np.append(heights * np.sqrt(areas), middle * np.sqrt(areas.sum()))
+    solution = np.linalg.lstsq(system, target, rcond=None)[0]
+    corners = mesh.vertices[mesh.faces[patch]].reshape(-1, 3)
+    along = corners @ axis
+    center = solution[:3] + ((along.min() + along.max()) / 2 - solution[:3] @ axis) * axis
+    spokes = corners - center
+    distances = np.linalg.norm(spokes - np.outer(spokes @ axis, axis), axis=1)
+    if -solution[3] < 0.3 * distances.min() or not _faces_all_ways(across, axis):
+        return None
+    return Hole(center, axis, float(distances.min()), float(along.max() - along.min()))
+
+
+def _joined(holes: list[Hole], new: Hole) -> list[Hole]:
+    """Holes with a new one; rings of one wall, apart where a thread or a seam parts them, become one."""
+    for index, old in enumerate(holes):
+        way = new.center - old.center
+        along = float(way @ old.axis)
+        aside = np.linalg.norm(way - along * old.axis)
+        if aside < 0.3 * old.radius and abs(along) < (old.depth + new.depth) / 2 + old.radius:
+            low, high = min(-old.depth / 2, along - new.depth / 2), max(old.depth / 2, along + new.depth / 2)
+            center = old.center + (low + high) / 2 * old.axis
+            joined = Hole(center, old.axis, min(old.radius, new.radius), high - low)
+            return _joined([*holes[:index], *holes[index + 1 :]], joined)
+    return [*holes, new]
+
+
+def _faces_all_ways(across: np.ndarray, axis: np.ndarray) -> bool:
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    angles = np.sort(np.arctan2(across @ np.cross(axis, first), across @ first))
+    return bool(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max() < _OPENING)
