@@ -107,6 +107,23 @@ def test_every_input_and_parameter_can_be_differentiated():
     )
 
 
+def test_scatter_follows_its_shape_over_the_detector():
+    model = PolyenergeticTransmission([STEEL], tungsten_spectrum(90), scatter=0.2)
+    lengths, shape = random_lengths(1, 1, 2, 6, 6), 0.5 + torch.rand(2, 6, 6, dtype=torch.float64)
+    primary = torch.exp(-model(lengths, scatter=torch.zeros(1)))
+    expected = -torch.log(primary + 0.2 * shape) + math.log(1.2)
+    torch.testing.assert_close(model(lengths, scatter_shape=shape), expected)
+
+
+def test_gradients_know_the_shape_of_the_scatter():
+    model = PolyenergeticTransmission([STEEL], tungsten_spectrum(90), num_bins=3)
+    lengths, shape = random_lengths(1, 1, 1, 4, 4).requires_grad_(), torch.rand(1, 2, 2, dtype=torch.float64)
+    scatter = torch.tensor([0.1], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda x, s: model(x, scatter=s, pooling=2, scatter_shape=shape), (lengths, scatter)
+    )
+
+
 def test_the_modules_own_parameters_receive_gradients():
     model = PolyenergeticTransmission([STEEL], tungsten_spectrum(90), scatter=0.1, blur_sigma_px=0.6, hardness=0.2)
     lengths = random_lengths(4, 1, 1, 6, 6)

@@ -55,6 +55,14 @@ def test_a_registration_that_is_told_of_no_screw_finds_it_and_its_shape(mesh: tr
     assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.05
 
 
+def test_screws_are_not_looked_for_where_that_is_not_wanted(mesh: trimesh.Trimesh) -> None:
+    data = image(scene_of(mesh, components=(TRUE.component("true", "steel", 0.5),)), CONFIG)
+    stages = (Stage(bin=2, oversampling=1, iterations=1, screws="find"),)
+    config = CONFIG.model_copy(update={"stages": stages, "find_screws": False})
+    result = register(ImplantPointCloud.from_mesh(mesh, 0.5), data, config, holes=find_holes(mesh))
+    assert result.screws == []
+
+
 def test_shapes_are_the_slopes_of_the_images(mesh: trimesh.Trimesh) -> None:
     model = StageModel(scene_of(mesh), image(scene_of(mesh), CONFIG), CONFIG.stages[0], CONFIG)
     shapes = ScrewShapes([TRUE], model.screw_path)

@@ -88,6 +88,23 @@ def test_a_mask_changes_the_similarity():
     assert gradient_correlation(y, x, mask=hole(1, 10, 9)) != gradient_correlation(y, x)
 
 
+def test_weights_count_pixels_as_if_there_were_that_many():
+    x, y = images(1, 12, 11)[0].numpy(), images(1, 12, 11, seed=1)[0].numpy()
+    weights = np.random.default_rng(2).integers(0, 4, x.shape)
+    weights[[0, -1]] = weights[:, [0, -1]] = 0  # the two filters' borders differ
+    pairs = [[np.repeat(scipy.ndimage.sobel(z, axis).ravel(), weights.ravel()) for z in (y, x)] for axis in (0, 1)]
+    expected = np.mean([np.corrcoef(*pair)[0, 1] for pair in pairs])
+    similarity = GradientCorrelation(torch.from_numpy(x[None]), weights=torch.from_numpy(weights[None].astype(float)))
+    assert float(similarity(torch.from_numpy(y[None]))) == pytest.approx(expected, abs=1e-12)
+
+
+def test_squared_residuals_sum_to_the_loss_under_weights():
+    x, y, weights = images(2, 10, 9), images(3, 2, 10, 9, seed=1), images(2, 10, 9, seed=2).abs()
+    similarity = GradientCorrelation(x, torch.ones(2, 10, 9), weights)
+    loss = similarity.residuals(y).square().sum((-3, -2, -1)) / 4
+    torch.testing.assert_close(loss, 1 - similarity(y))
+
+
 def test_a_view_masked_as_a_whole_gives_zero():
     x, mask = images(2, 8, 8), torch.ones(2, 8, 8)
     mask[0] = 0
@@ -142,7 +159,7 @@ def test_wrong_images_are_refused_with_their_shapes():
     x = images(2, 8, 8)
     with pytest.raises(ValueError, match="agree in"):
         gradient_correlation(images(3, 8, 8), x)
-    with pytest.raises(ValueError, match="mask must have shape"):
+    with pytest.raises(ValueError, match="mask and weights must have shape"):
         gradient_correlation(x, x, mask=torch.ones(8, 8))
     with pytest.raises(ValueError, match="fixed must have shape"):
         GradientCorrelation(x[0])

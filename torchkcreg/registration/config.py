@@ -135,6 +135,7 @@ class RegistrationConfig(BaseModel):
         blur_px: Initial standard deviation of the detector's blur, pixels.
         background_mm: Smoothness of the estimated background, standard deviation in mm at the detector.
         background_material: What the background is made of, as far as it hardens the beam.
+        find_screws: Whether screws are looked for in the implant's holes where no components are given.
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp", "triton" or "torch".
@@ -157,6 +158,7 @@ class RegistrationConfig(BaseModel):
     blur_px: float = Field(0.7, ge=0)
     background_mm: float = Field(4.0, gt=0)
     background_material: str = "cortical_bone"
+    find_screws: bool = True
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
     backend: Literal["auto", "cpp", "triton", "torch"] = "auto"

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 # Parameter: (name in the intensity model, change for a unit step, lower bound, upper bound). The unit steps change a
 # radiograph about as much as a millimetre of motion, so that one step size suits all parameters.
 _PARAMETERS = {
-    "scatter": ("scatter", 0.05, 0.0, 1.0),
+    "scatter": ("scatter", 0.05, 0.0, 0.6),
     "blur": ("blur_sigma_px", 0.5, 0.0, 5.0),
     "hardness": ("hardness", 2.0, -5.0, 20.0),
 }

@@ -58,7 +58,7 @@ def build_scene(
         components=components,
         material=name,
         follow_radius_mm=config.follow_radius_mm,
-        holes=() if components else holes,
+        holes=holes if config.find_screws and not components else (),
         knows_spectrum=spectrum is not None,
     )
 

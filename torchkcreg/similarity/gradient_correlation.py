@@ -54,14 +54,15 @@ class GradientCorrelation(nn.Module):
     Args:
         fixed: measured images, shape (V, rows, cols), finite where they count.
         mask: shape (V, rows, cols), nonzero where pixels count, see `gradient_correlation`.
+        weights: shape (V, rows, cols), how much a pixel counts in means and sums, not negative; all alike if None.
 
     Raises:
-        ValueError: if shapes do not fit, or `fixed` is not finite at a pixel that counts.
+        ValueError: if shapes do not fit, weights are negative, or `fixed` is not finite at a pixel that counts.
 
     Attributes:
         unit_gradients: buffer (V, 2, rows, cols), the fixed derivatives with mean 0 and norm 1 over the mask.
         mask: boolean buffer (V, rows, cols) or None.
-        eroded_mask: boolean buffer (V, rows, cols) or None, the pixels whose derivatives count.
+        eroded_mask: buffer (V, rows, cols) or None, how much each pixel's derivatives count.
 
     Example:
         >>> x = torch.rand(3, 16, 16)
@@ -87,6 +88,10 @@ class GradientCorrelation(nn.Module):
             raise ValueError(f"fixed must be finite where it counts, got {int((~counted).sum())} pixels that are not")
         eroded = None if mask is None else erode_mask(mask)
         if weights is not None:
+            _check_mask(weights, fixed)
+            if not bool((weights >= 0).all()):
+                raise ValueError("weights must not be negative")
+            weights = weights.detach().to(fixed.dtype)
             eroded = weights if eroded is None else eroded * weights
         self.register_buffer("mask", mask)
         self.register_buffer("eroded_mask", eroded)
@@ -180,4 +185,4 @@ def _check_images(moving: Tensor, fixed: Tensor) -> None:
 
 def _check_mask(mask: Tensor, fixed: Tensor) -> None:
     if mask.shape != fixed.shape[-3:]:
-        raise ValueError(f"mask must have shape {tuple(fixed.shape[-3:])}, got {tuple(mask.shape)}")
+        raise ValueError(f"mask and weights must have shape {tuple(fixed.shape[-3:])}, got {tuple(mask.shape)}")

@@ -43,11 +43,11 @@ def normalized_cross_correlation(a: Tensor, b: Tensor, *, mask: Tensor | None = 
 
 
 def unit_contrast(images: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
-    """Images minus their mean over the mask, zero outside it, scaled to Euclidean norm 1; all zero if flat.
+    """Images minus their weighted mean, times the roots of the weights, scaled to norm 1; all zero if flat.
 
     Args:
         images: shape (..., rows, cols), finite.
-        mask: broadcastable to `images`, nonzero where pixels count, or None.
+        mask: weights of the pixels, broadcastable to `images`, not negative, or None for all alike.
         scale: shape (...), the size of the values that `images` were computed from: contrast below
             16 rounding errors of it is noise, and the image flat.
 

@@ -1,0 +1,126 @@
+"""What each part of a registration is worth: BB and node errors on simulated plates, with one part left out at a time.
+
+    python benchmarks/ablation.py            # every case, about 15 minutes on two cores
+    python benchmarks/ablation.py --quick    # one case
+
+The cases are made by `torchkcreg.simulation`: a plate under axial load seen obliquely and face on, and a plate on four
+screws bent at every hole. The table goes to `benchmarks/results/ablation.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from torchkcreg.evaluation import bb_rmse
+from torchkcreg.implant import Component, ImplantPointCloud, find_holes
+from torchkcreg.physics import line_integrals_from_intensity
+from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, preset_stages, register
+from torchkcreg.simulation import Load, SimulatedCase, weight_bearing_case
+
+CASES = {
+    "axial load, 48 degrees": {"load": 1.0, "seed": 0, "views": (47, 48, 49)},
+    "axial load, face on": {"load": 1.0, "seed": 1, "views": (91, 92, 93)},
+    "S-bend, 48 degrees": {
+        "load": Load(s_bend_deg=6.0, torsion_deg=2.0, zone_mm=63.0, translation_mm=(0.6, -0.8, 0.5)),
+        "seed": 3,
+        "views": (47, 48, 49),
+        "mode": "s_bend",
+    },
+}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A registration with something left out."""
+
+    name: str
+    config: RegistrationConfig
+    knows_screws: bool = True
+    knows_spectrum: bool = True
+    finds_screws: bool = True
+
+
+def variants() -> Iterator[Variant]:
+    """All of them, the whole first."""
+    default = RegistrationConfig(material="steel")
+    stages = preset_stages("gauss-newton")
+
+    def having(**changes: object) -> RegistrationConfig:
+        updates = [{k: v for k, v in changes.items() if k in stage.model_fields_set} for stage in stages]
+        changed = tuple(s.model_copy(update=u) for s, u in zip(stages, updates, strict=True))
+        return default.model_copy(update={"stages": changed})
+
+    groups = (
+        *(s for s in stages if s.modes is None),
+        Stage(groups=5, pitch_factor=2, estimate=stages[-1].estimate, background=True, robust=True, screws="fit"),
+        Stage(groups=10, pitch_factor=2, estimate=stages[-1].estimate, background=True, robust=True, screws="fit"),
+    )
+    yield Variant("everything; screws and spectrum given", default)
+    yield Variant("everything; screws found, spectrum assumed", default, knows_screws=False, knows_spectrum=False)
+    yield Variant("no weights of pixels", having(robust=False))
+    yield Variant("no background", having(background=False))
+    yield Variant("no estimate of scatter and blur", having(estimate=()))
+    yield Variant("5 and 10 groups in place of modes", default.model_copy(update={"stages": groups}))
+    yield Variant("no charge for loads", default.model_copy(update={"load_weight": 0.0}))
+    yield Variant("screws neither given nor looked for", default, knows_screws=False, finds_screws=False)
+    yield Variant("line integrals in place of materials", default.model_copy(update={"material": None}))
+
+
+def errors(case: SimulatedCase, variant: Variant) -> tuple[float, float, float]:
+    """BB RMSE and node RMSE in mm, and seconds."""
+    config = variant.config
+    cloud = ImplantPointCloud.from_mesh(case.implant, config.pitch_mm)
+    name = config.material or "implant"
+    screws = [
+        Component.screw(f"screw{i}", s["from"], s["to"], s["radius"], material=name, pitch=config.pitch_mm)
+        for i, s in enumerate(case.screws)
+    ]
+    data = RegistrationData(
+        case.geometry,
+        *line_integrals_from_intensity(case.intensity.double(), case.open_beam, saturation=case.saturation),
+    )
+    start = time.perf_counter()
+    result = register(
+        cloud,
+        data,
+        config,
+        spectrum=case.spectrum if variant.knows_spectrum and config.material else None,
+        components=screws if variant.knows_screws else (),
+        holes=find_holes(case.implant) if variant.finds_screws else (),
+    )
+    seconds = time.perf_counter() - start
+    nodes = cloud.coarsened(8).points.double()
+    bb = bb_rmse(result.warp(case.beads_before.double()), case.beads_after.double())
+    node = bb_rmse(result.warp(nodes), case.deform(nodes))
+    return float(bb), float(node), seconds
+
+
+def main() -> None:
+    """Writes the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="the first case alone")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "ablation.md")
+    options = parser.parse_args()
+    names = list(CASES)[:1] if options.quick else list(CASES)
+    cases = {name: weight_bearing_case(**CASES[name]) for name in names}
+    heads = [f"{name}: BB / nodes (mm)" for name in names]
+    lines = [f"| registration | {' | '.join(heads)} | s |", "| --- |" + " --- |" * (len(names) + 1)]
+    for variant in tqdm(list(variants()), desc="variants"):
+        found = [errors(case, variant) for case in cases.values()]
+        cells = " | ".join(f"{bb:.3f} / {node:.3f}" for bb, node, _ in found)
+        lines.append(f"| {variant.name} | {cells} | {sum(f[2] for f in found) / len(found):.0f} |")
+        tqdm.write(lines[-1])
+    how = f"Three views each; {torch.get_num_threads()} threads, torch {torch.__version__}."
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text("\n".join([*lines, "", f"{how} Made by `python benchmarks/ablation.py`.", ""]))
+
+
+if __name__ == "__main__":
+    main()
