@@ -89,6 +89,7 @@ def _add_register(commands) -> None:
     command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")
     command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
     command.add_argument("--seed", type=int, help="seed of the random numbers")
+    command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
     command.add_argument("--backend", help="projector: auto, cpp, triton or torch")
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
     existing = command.add_mutually_exclusive_group()
@@ -104,29 +105,20 @@ def _integers(text: str) -> list[int]:
 
 
 def _register(options: argparse.Namespace) -> None:
-    from torchkcreg.experiments import RegistrationFiles, register_files
+    from torchkcreg.experiments import RegistrationFiles, register_files, register_seeds
 
-    files = RegistrationFiles(
-        implant=options.implant,
-        geometry=options.geometry,
-        projections=options.projections,
-        spectrum=options.spectrum,
-        components=options.components,
-        init=options.init,
-        views=options.views,
-        open_beam=options.open_beam,
-        config=options.config,
-    )
+    if options.seeds is not None and options.resume:
+        raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")
+    files = RegistrationFiles(**{name: getattr(options, name) for name in RegistrationFiles.__dataclass_fields__})
     names = ("material", "preset", "pitch_mm", "seed", "backend")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    result = register_files(
-        files,
-        options.out,
-        overrides=overrides,
-        overwrite=options.overwrite,
-        resume=options.resume,
-        figures=not options.no_figures,
-    )
+    how = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}
+    if options.seeds is not None:
+        runs = register_seeds(files, options.out, options.seeds, **how)
+        result = runs.result
+        print(runs)
+    else:
+        result = register_files(files, options.out, resume=options.resume, **how)
     similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())
     print(f"gradient correlation of each view {similarity}; run folder {options.out}")
 
@@ -199,7 +191,9 @@ def _add_reconstruct(commands) -> None:
     command.add_argument("--iterations", type=int, help="passes through all views")
     command.add_argument("--subsets", type=int, help="ordered subsets")
     command.add_argument("--beta", type=float, help="weight of the roughness (default: 10)")
-    command.add_argument("--passes", type=int, help="2: correct for mineral and for scatter behind metal, from pass 1")
+    command.add_argument(
+        "--passes", type=int, help="2: correct for mineral and scatter behind metal, from pass 1 (default of kcrec)"
+    )
     command.add_argument("--window", help="of the ramp: ram-lak, shepp-logan, cosine, hamming or hann (default)")
     command.add_argument("--scatter", help="auto (default), none, or its fraction of the primary")
     command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")

@@ -9,6 +9,7 @@ from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_
 from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles, ReconstructionOptions
 from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
 from torchkcreg.experiments.registered_components import registered_components
+from torchkcreg.experiments.seeds import SeedRuns, register_seeds
 
 __all__ = [
     "CaptureStudy",
@@ -17,6 +18,7 @@ __all__ = [
     "ReconstructionFiles",
     "ReconstructionOptions",
     "RegistrationFiles",
+    "SeedRuns",
     "capture_study",
     "demo",
     "describe",
@@ -25,6 +27,7 @@ __all__ = [
     "evaluate_files",
     "reconstruct_files",
     "register_files",
+    "register_seeds",
     "registered_components",
     "resolve_config",
     "resolve_options",

@@ -44,9 +44,15 @@ def draw_registration(
         "displacement.png": _displacement(result, scene),
     }
     if result.history:
-        labels = [f"{s.groups} group{'s' * (s.groups > 1)}" for s in result.config.schedule()]
+        labels = [_stage_label(stage) for stage in result.config.schedule()]
         figures["history.png"] = history_figure(result.history, stage_labels=labels)
     return figures
+
+
+def _stage_label(stage: Stage) -> str:
+    if stage.modes is not None:
+        return f"{stage.modes} modes"
+    return f"{stage.groups} group{'s' * (stage.groups > 1)}"
 
 
 def start_scene(scene: Scene, initial: Tensor) -> Scene:
@@ -84,8 +90,9 @@ def _drr(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Te
 
 @torch.no_grad()
 def _similarity(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Tensor:
-    """GC (V,) as the last stage has it, so that start and result are measured alike."""
-    objective = stage_objective(scene, data, result.config.schedule()[-1], result.config)
+    """GC (V,) as the result has it, so that start and result are measured alike."""
+    stage = result.config.schedule()[-1].model_copy(update={"robust": False})
+    objective = stage_objective(scene, data, stage, result.config)
     return objective.gradient_correlations(objective.model.at_rest)[0]
 
 

@@ -126,7 +126,7 @@ def _reconstructed(
         components=inputs.components,
         scatter=inputs.scatter,
         mask=inputs.mask,
-        passes=options.passes,
+        passes=options.num_passes,
         initial=initial,
         shard=shard,
         backend=backend,

@@ -61,7 +61,7 @@ class ReconstructionOptions(BaseModel):
         subsets: Overrides the preset's.
         beta: Weight of the roughness.
         passes: Of the iterative methods; from the second on, mineral's hardening and the scatter in the metal's shadow
-            are known from the pass before.
+            are known from the pass before. None: two of "kcrec", which needs both, one of "pwls".
         window: Of the ramp.
         scatter: "auto" fits a smooth one to the air around the object, "none", or its fraction of the primary.
         scatter_sigma_mm: How broad a given fraction's scatter is.
@@ -80,13 +80,20 @@ class ReconstructionOptions(BaseModel):
     iterations: int | None = Field(None, ge=1)
     subsets: int | None = Field(None, ge=1)
     beta: float = Field(10.0, ge=0)
-    passes: int = Field(1, ge=1)
+    passes: int | None = Field(None, ge=1)
     window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = "hann"
     scatter: Literal["auto", "none"] | float = "auto"
     scatter_sigma_mm: float = Field(40.0, gt=0)
     monoenergetic: bool = False
     material: str | None = None
     backend: Literal["auto", "cpp", "torch"] = "auto"
+
+    @property
+    def num_passes(self) -> int:
+        """Passes that are made."""
+        if self.passes is not None:
+            return self.passes
+        return 2 if self.method == "kcrec" else 1
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from pydantic import ValidationError
 from torch import Tensor
 
@@ -24,7 +25,7 @@ from torchkcreg.registration import (
 )
 
 from .figures import draw_registration
-from .inputs import RegistrationFiles, read_inputs
+from .inputs import RegistrationFiles, RegistrationInputs, read_inputs
 
 RECORD_KEYS = {"files", "options", "schedule"}
 
@@ -78,6 +79,26 @@ def register_files(
     start = time.perf_counter()
     config = resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
+    trainer = prepared_trainer(inputs, config)
+    record = run_record(files, config)
+    run = RunFolder.create(out, overwrite=overwrite, resume=resume)
+    if resume:
+        _continue(run, trainer, record)
+    else:
+        run.start(record)
+    result = train(trainer, run, inputs, callbacks=callbacks)
+    for message in result.warnings[len(inputs.warnings) :]:
+        warnings.warn(message, stacklevel=2)
+    write_run(run, result, trainer, inputs, seconds=time.perf_counter() - start, figures=figures)
+    return result
+
+
+def prepared_trainer(inputs: RegistrationInputs, config: RegistrationConfig) -> Trainer:
+    """A trainer at the start pose.
+
+    Raises:
+        ValueError: If the implant lies outside every view.
+    """
     scene = build_scene(
         inputs.implant,
         config,
@@ -86,26 +107,38 @@ def register_files(
         implant_to_world=inputs.implant_to_world,
         holes=inputs.holes,
     )
-    initial = scene.implant_to_world.clone()
     trainer = Trainer(scene, inputs.data, config, callbacks=[ProgressBar()])
     trainer.check()
-    record = _record(files, config)
-    run = RunFolder.create(out, overwrite=overwrite, resume=resume)
-    if resume:
-        _continue(run, trainer, record)
-    else:
-        run.start(record)
+    return trainer
+
+
+def train(
+    trainer: Trainer, run: RunFolder, inputs: RegistrationInputs, *, callbacks: Sequence[Callback] = ()
+) -> RegistrationResult:
+    """The result of a trainer whose checkpoints go to a run folder; its warnings begin with those of the inputs."""
     trainer.callbacks += [_Checkpoints(run), *callbacks]
     result = trainer.fit()
-    for message in result.warnings:
-        warnings.warn(message, stacklevel=2)
     result.warnings[:0] = inputs.warnings
-    run.write_metrics(_metrics(result, scene, initial, time.perf_counter() - start))
+    return result
+
+
+def write_run(
+    run: RunFolder,
+    result: RegistrationResult,
+    trainer: Trainer,
+    inputs: RegistrationInputs,
+    *,
+    seconds: float,
+    figures: bool,
+    more_metrics: dict[str, Any] | None = None,
+) -> None:
+    """Nothing; writes metrics, figures and the result of a finished registration to its run folder."""
+    initial = torch.eye(4, dtype=torch.float64) if inputs.implant_to_world is None else inputs.implant_to_world
+    run.write_metrics({**_metrics(result, trainer.scene, initial, seconds), **(more_metrics or {})})
     if figures:
-        for name, figure in draw_registration(result, scene, inputs.data, initial).items():
+        for name, figure in draw_registration(result, trainer.scene, trainer.data, initial).items():
             run.write_figure(name, figure)
     run.write_result(result, inputs.implant.points, initial_to_world=initial)
-    return result
 
 
 class _Checkpoints(Callback):
@@ -119,7 +152,7 @@ class _Checkpoints(Callback):
         self.run.write_history(trainer.history)
 
 
-def _record(files: RegistrationFiles, config: RegistrationConfig) -> dict[str, Any]:
+def run_record(files: RegistrationFiles, config: RegistrationConfig) -> dict[str, Any]:
     """What config.yaml keeps: files, options and the stages that they resolve to."""
     names = {k: str(v.resolve()) if isinstance(v, Path) else v for k, v in vars(files).items() if v is not None}
     schedule = [stage.model_dump(mode="json") for stage in config.schedule()]

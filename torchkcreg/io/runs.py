@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 CONFIG, VERSIONS, HISTORY, METRICS = "config.yaml", "versions.json", "history.json", "metrics.json"
 DEFORMATION, FIELD, TRANSFORM, CLOUD = "deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply"
 CHECKPOINT = "checkpoint.pt"
+SEEDS = "seeds"
 FIGURES = ("overlay.png", "displacement.png", "history.png")
 RUN_FILES = (DEFORMATION, CONFIG, VERSIONS, HISTORY, METRICS, FIELD, TRANSFORM, CLOUD, CHECKPOINT, *FIGURES)
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
@@ -45,6 +46,7 @@ class RunFolder:
     | `bspline.tfm` | ITK transform, see `itk_transform` |
     | `implant_deformed.ply` | the deformed point cloud with the displacement of each node |
     | `overlay.png`, `displacement.png`, `history.png` | figures |
+    | `seeds/<seed>/` | a run folder of each seed, where several were run |
 
     Use `RunFolder.create` for a new or resumed run and `read_run` for a finished one.
     """
@@ -88,6 +90,10 @@ class RunFolder:
         """Nothing; writes `config.yaml`, which makes the folder a run, and `versions.json`."""
         write_config(self.path / CONFIG, config)
         write_json(self.path / VERSIONS, versions())
+
+    def of_seed(self, seed: int) -> RunFolder:
+        """The run folder, made anew, that keeps the run of one seed of several."""
+        return RunFolder.create(self.path / SEEDS / str(seed))
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Nothing; writes the checkpoint, in place of the last one only when it is whole.
@@ -172,6 +178,16 @@ class RunFolder:
             leftover.unlink(missing_ok=True)
         for name in names:
             (self.path / name).unlink(missing_ok=True)
+        if names:
+            self._discard_seeds(names)
+
+    def _discard_seeds(self, names: tuple[str, ...]) -> None:
+        folder = self.path / SEEDS
+        for config in folder.glob(f"*/{CONFIG}"):
+            RunFolder(config.parent)._discard(names)
+        for emptied in (*folder.glob("*/"), folder):
+            if emptied.is_dir() and not any(emptied.iterdir()):
+                emptied.rmdir()
 
 
 def read_run(path: str | os.PathLike[str]) -> RegistrationResult:

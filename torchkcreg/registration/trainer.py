@@ -97,7 +97,8 @@ class Trainer:
 
     def _result(self) -> RegistrationResult:
         scene = self.scene
-        final = stage_objective(scene, self.data, self.stages[-1], self.config)
+        whole = self.stages[-1].model_copy(update={"robust": False})  # every pixel counts alike in what is reported
+        final = stage_objective(scene, self.data, whole, self.config)
         with torch.no_grad():
             gc = final.gradient_correlations(final.model.at_rest)[0]
         intensity = {name: float(value.detach()) for name, value in scene.intensity.named_parameters()}
