@@ -68,7 +68,7 @@ def test_every_flag_in_the_readme_exists(capsys):
     from torchkcreg.cli import main
 
     texts = []
-    for command in ("register", "warp", "evaluate", "info", "demo"):
+    for command in ("register", "warp", "evaluate", "reconstruct", "info", "demo"):
         assert main([command, "--help"]) == 0
         texts.append(capsys.readouterr().out)
     flags = set(re.findall(r"(?<![\w-])--[a-z]+(?:-[a-z]+)*", README)) - {"--no-build-isolation"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 OptimizerName = Literal["gauss-newton", "cmaes", "adam"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
@@ -31,6 +31,8 @@ class Stage(BaseModel):
         margin_mm: What is seen around the implant's projection, mm at the detector; None: the whole detector.
         background: Before the stage, what the model lacks (bone, water) is estimated as a smooth path length, and DRRs
             include it.
+        slide: After a stage of one group, the implant is tried all along its long axis; where it fits better elsewhere,
+            the stage runs again from there.
         screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
             or those found before have their lengths and radius estimated along ("fit").
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
@@ -52,9 +54,16 @@ class Stage(BaseModel):
     population: int = Field(40, ge=4)
     margin_mm: float | None = Field(6.0, ge=0)
     background: bool = False
+    slide: bool = False
     screws: Literal["find", "fit"] | None = None
     robust: bool = False
     estimate: tuple[NuisanceName, ...] = ()
+
+    @model_validator(mode="after")
+    def _slides_as_one(self) -> Stage:
+        if self.slide and (self.groups > 1 or self.modes is not None):
+            raise ValueError(f"only a stage of one group can slide, this one has {self.groups} groups")
+        return self
 
 
 def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
@@ -76,6 +85,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         step_mm=4.0,
         population=16,
         margin_mm=25.0,
+        slide=True,
     )
     physics: tuple[NuisanceName, ...] = ("scatter", "blur")
     levels = [

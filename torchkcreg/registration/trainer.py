@@ -21,6 +21,7 @@ from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
 from .screws import find_screws
+from .slide import slid
 
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
@@ -84,7 +85,12 @@ class Trainer:
             for callback in self.callbacks:
                 callback.on_iteration(self, index, progress)
 
-        objective.accept(minimize(objective, stage, seed=self.config.seed + index, report=report))
+        found = minimize(objective, stage, seed=self.config.seed + index, report=report)
+        if stage.slide and (elsewhere := slid(objective, found)) is not None:
+            objective.accept(elsewhere)
+            objective = stage_objective(self.scene, self.data, stage, self.config)
+            found = minimize(objective, stage, seed=self.config.seed + index, report=report)
+        objective.accept(found)
         self.next_stage = index + 1
         for callback in self.callbacks:
             callback.on_stage_end(self, index, stage)
