@@ -138,3 +138,9 @@ def test_wrong_input_is_one_line_that_names_it(ball_scan, small_run, tmp_path, c
     assert "needs geometry and projections" in capsys.readouterr().err
     with pytest.raises(ValueError, match="unknown_key: Extra inputs"):
         resolve_options({"unknown_key": 1})
+
+
+def test_known_components_take_two_passes_unless_told_otherwise() -> None:
+    assert ReconstructionOptions(method="kcrec").num_passes == 2
+    assert ReconstructionOptions(method="kcrec", passes=1).num_passes == 1
+    assert ReconstructionOptions(method="pwls").num_passes == 1
