@@ -12,16 +12,16 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
 from torchkcreg.evaluation import bb_rmse
-from torchkcreg.implant import Component, ImplantPointCloud, find_holes
-from torchkcreg.physics import line_integrals_from_intensity
-from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, preset_stages, register
+from torchkcreg.experiments.capture import registration_inputs
+from torchkcreg.implant import find_holes
+from torchkcreg.registration import RegistrationConfig, Stage, preset_stages, register
 from torchkcreg.simulation import Load, SimulatedCase, weight_bearing_case
 
 CASES = {
@@ -76,16 +76,9 @@ def variants() -> Iterator[Variant]:
 def errors(case: SimulatedCase, variant: Variant) -> tuple[float, float, float]:
     """BB RMSE and node RMSE in mm, and seconds."""
     config = variant.config
-    cloud = ImplantPointCloud.from_mesh(case.implant, config.pitch_mm)
-    name = config.material or "implant"
-    screws = [
-        Component.screw(f"screw{i}", s["from"], s["to"], s["radius"], material=name, pitch=config.pitch_mm)
-        for i, s in enumerate(case.screws)
-    ]
-    data = RegistrationData(
-        case.geometry,
-        *line_integrals_from_intensity(case.intensity.double(), case.open_beam, saturation=case.saturation),
-    )
+    data, cloud, screws = registration_inputs(case, config.pitch_mm)
+    if config.material is None:
+        screws = [replace(screw, material="implant") for screw in screws]
     start = time.perf_counter()
     result = register(
         cloud,

@@ -88,7 +88,8 @@ def test_kcrec_takes_implant_and_files_from_the_run(small_run, tmp_path):
     background, _ = read_volume(tmp_path / "out" / "volume.mha")
     whole, _ = read_volume(tmp_path / "out" / "with_implant.mha")
     assert whole.max() > 5 * background.max().clamp_min(0.01)
-    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["components"].count("steel") > 1
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["components"].count("steel") > 1 and metrics["passes"] == 2
 
 
 def test_the_registered_metal_has_the_volume_of_its_meshes(small_run, small_case):
@@ -99,6 +100,26 @@ def test_the_registered_metal_has_the_volume_of_its_meshes(small_run, small_case
     assert components[0].cloud.volume == pytest.approx(read_mesh(small_case / "implant.stl").volume, rel=0.01)
     plate_alone = registered_components(small_run, components=small_case / "screws.json")
     assert len(plate_alone) == 7
+
+
+def test_screws_that_a_registration_found_are_known_components(small_case, tmp_path):
+    files = RegistrationFiles(
+        implant=small_case / "implant.stl",
+        geometry=small_case / "geometry.json",
+        projections=small_case / "projections.npz",
+    )
+    stages = [{"bin": 4, "iterations": 2, "oversampling": 1, "screws": "find"}]
+    overrides = {"material": "steel", "pitch_mm": 1.0, "stages": stages}
+    result = register_files(files, tmp_path / "run", overrides=overrides, figures=False)
+    plate, *screws = registered_components(tmp_path / "run")
+    assert len(screws) == len(result.screws) >= 1
+    for screw, found in zip(screws, result.screws, strict=True):
+        ends = torch.tensor([found["start"], found["end"]])
+        volume = torch.pi * found["radius"] ** 2 * (ends[1] - ends[0]).norm()
+        assert screw.material == plate.material
+        assert screw.cloud.volume == pytest.approx(float(volume), rel=0.03)
+    told = registered_components(tmp_path / "run", components=small_case / "screws.json")
+    assert len(told) == 7
 
 
 def test_a_stopped_reconstruction_resumes_to_the_same_volume(ball_scan, tmp_path, monkeypatch):

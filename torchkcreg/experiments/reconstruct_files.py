@@ -91,7 +91,7 @@ def reconstruct_files(
         run = _folder(out, record, overwrite=overwrite, resume=resume) if rank == 0 else None
         state = RunFolder(out).load_checkpoint() if resume else None
         volume, history = _reconstructed(files, inputs, options, shard, run, state)
-        metrics = _metrics(inputs, volume, history, time.perf_counter() - start)
+        metrics = _metrics(inputs, options, volume, history, time.perf_counter() - start)
         if run is not None:
             _write(run, inputs, volume, metrics, figures)
     return metrics
@@ -146,7 +146,11 @@ def _checkpoints(run: RunFolder, iterations: int) -> Callable[[int, PWLS, dict[s
 
 
 def _metrics(
-    inputs: ReconstructionInputs, volume: Tensor, history: list[dict[str, Any]], seconds: float
+    inputs: ReconstructionInputs,
+    options: ReconstructionOptions,
+    volume: Tensor,
+    history: list[dict[str, Any]],
+    seconds: float,
 ) -> dict[str, Any]:
     scatter, beam = inputs.scatter, inputs.beam
     return {
@@ -158,6 +162,7 @@ def _metrics(
         "water": beam.water,
         "scatter": None if scatter is None else {"fraction": scatter.fraction, "sigma_mm": scatter.sigma_mm},
         "components": [component.material for component in inputs.components],
+        "passes": None if options.method == "fdk" else options.num_passes,
         "history": history,
         "seconds": seconds,
     }

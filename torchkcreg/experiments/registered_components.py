@@ -23,7 +23,8 @@ def registered_components(
 
     Args:
         run: folder of a finished registration.
-        components: screws to take instead of those of the registration; each follows the implant near its head.
+        components: screws to take instead of those of the registration, which were given to it or which it found;
+            each follows the implant near its head.
         material: the implant's, where the registration had none.
         pitch_mm: of the nodes; the registration's if None.
 
@@ -39,9 +40,17 @@ def registered_components(
     mesh = read_mesh(files["implant"])
     known = [KnownComponent.from_mesh(deformed_surface(result, mesh, longest_edge_mm=2.0), name, pitch=pitch)]
     path = components or (Path(files["components"]) if files.get("components") else None)
-    specs = read_components(path) if path is not None else []
+    specs = read_components(path) if path is not None else _found_screws(result, name)
     screws = [KnownComponent.from_mesh(_placed_screw(s, mesh, result), s.material, pitch=pitch) for s in specs]
     return [*known, *screws]
+
+
+def _found_screws(result: RegistrationResult, material: str) -> list[ComponentSpec]:
+    """The screws that a registration found, of the implant's material, under the names their motions are kept by."""
+    return [
+        ComponentSpec(tuple(s["start"]), tuple(s["end"]), s["radius"], material, f"found{i}")
+        for i, s in enumerate(result.screws)
+    ]
 
 
 def _record(run: Path) -> tuple[dict, dict]:
