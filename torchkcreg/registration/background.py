@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from torchkcreg.physics import gaussian_blur
 
 from .config import RegistrationConfig, Stage
-from .data import RegistrationData
+from .data import RegistrationData, resized
 from .model import StageModel
 from .scene import Scene
 
@@ -40,7 +39,7 @@ def estimate_background(scene: Scene, data: RegistrationData, config: Registrati
     sigma = config.background_mm / model.data.geometry.pixel_spacing[1]
 
     def transmission(background: Tensor) -> Tensor:
-        unknown = _resized(background, tuple(paths.shape[-2:]))
+        unknown = resized(background, paths.shape[-2:])
         lengths = torch.cat([paths, unknown[None, None]], dim=1)
         return torch.exp(-scene.intensity(lengths, pooling=stage.oversampling, **physics))[0]
 
@@ -54,8 +53,4 @@ def estimate_background(scene: Scene, data: RegistrationData, config: Registrati
         slope = (squares / window(known * transmission(background + _PROBE_MM))).log() / _PROBE_MM
         ratio = window(known * primary) / squares
         background = background - ratio.clamp(0.02, 5.0).log() / slope.clamp_min(1e-3)
-    return _resized(background, tuple(data.geometry.det_shape))
-
-
-def _resized(images: Tensor, size: tuple[int, ...]) -> Tensor:
-    return interpolate(images[None], size=size, mode="bilinear", align_corners=False)[0]
+    return resized(background, data.geometry.det_shape)

@@ -134,10 +134,7 @@ class RegistrationData:
         transmission = adaptive_avg_pool2d(torch.exp(-self.line_integrals) * self.mask, self._blocks(factor))
         share = adaptive_avg_pool2d(self.mask.float(), self._blocks(factor))
         smooth = gaussian_blur(transmission, sigma) / gaussian_blur(share, sigma).clamp_min(1e-3)
-        size = tuple(self.geometry.det_shape)
-        return replace(
-            self, scatter_shape=interpolate(smooth[None], size=size, mode="bilinear", align_corners=False)[0]
-        )
+        return replace(self, scatter_shape=resized(smooth, self.geometry.det_shape))
 
     def _blocks(self, factor: int) -> tuple[int, int]:
         rows, cols = self.geometry.det_shape
@@ -149,3 +146,8 @@ class RegistrationData:
 
     def _images(self) -> dict[str, Tensor]:
         return {"line_integrals": self.line_integrals, "mask": self.mask, **self._estimates()}
+
+
+def resized(images: Tensor, det_shape: tuple[int, int]) -> Tensor:
+    """Smooth images (V, rows, cols) on other pixels of the same detector."""
+    return interpolate(images[None], size=tuple(det_shape), mode="bilinear", align_corners=False)[0]

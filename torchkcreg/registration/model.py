@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from torchkcreg.deformation import cluster_control_points, control_point_masses, group_centers, group_moments
 from torchkcreg.geometry import fit_rigid, transform_points
@@ -14,7 +13,7 @@ from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.projector import cell_footprint, project_points
 
 from .config import RegistrationConfig, Stage
-from .data import RegistrationData
+from .data import RegistrationData, resized
 from .elasticity import Elasticity, ModalMotion
 from .found_screw import FoundScrew, ScrewShapes
 from .motion import GroupMotion
@@ -128,7 +127,8 @@ class StageModel:
             self.data = self.data.windowed(torch.cat([points[0] for points in at_start]), margin_px)
         fine = self.data.geometry.refined(stage.oversampling)
         self.matrices, self.det_shape = fine.projection_matrices.float(), fine.det_shape
-        self.background = _resized(self.data.background, fine.det_shape)
+        behind = self.data.background
+        self.background = None if behind is None else resized(behind, fine.det_shape)
         cell = self.implant.cell.float() @ self.scene.implant_to_world[:3, :3].float().T
         self.footprints = [cell_footprint(points[0], cell, self.matrices) for points in at_start]
 
@@ -214,13 +214,6 @@ class StageModel:
         """DRRs (K, V, rows, cols) of candidates (K, D)."""
         paths, options = self.path_lengths(parameters), self.intensity_options(parameters)
         return self.scene.intensity(paths, pooling=self.stage.oversampling, **options)
-
-
-def _resized(images: Tensor | None, size: tuple[int, int]) -> Tensor | None:
-    """Smooth images (V, rows, cols) on other pixels of the same detector."""
-    if images is None:
-        return None
-    return interpolate(images[None], size=tuple(size), mode="bilinear", align_corners=False)[0]
 
 
 def _coarsened(cloud: ImplantPointCloud, factor: int) -> ImplantPointCloud:
