@@ -39,7 +39,7 @@ def estimate_background(scene: Scene, data: RegistrationData, config: Registrati
     sigma = config.background_mm / model.data.geometry.pixel_spacing[1]
 
     def transmission(background: Tensor) -> Tensor:
-        unknown = resized(background, paths.shape[-2:])
+        unknown = resized(background, (paths.shape[-2], paths.shape[-1]))
         lengths = torch.cat([paths, unknown[None, None]], dim=1)
         return torch.exp(-scene.intensity(lengths, pooling=stage.oversampling, **physics))[0]
 
