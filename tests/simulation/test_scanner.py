@@ -118,3 +118,11 @@ def test_wrong_scenes_and_detectors_are_refused():
     for wrong in ({"scatter_fraction": -0.1}, {"photons": 0.0}, {"bits": 17}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             DetectorModel(**wrong)
+
+
+def test_scatter_from_what_is_removed_vanishes_in_the_open_beam_and_glare_keeps_the_signal():
+    scanner = replace(IDEAL, scatter_removed=0.3, glare_share=0.1)
+    assert (simulate_projections(GEOMETRY, [], MONO, detector=scanner) == 60000).all()
+    rod = Part("rod", Cylinder([0, 0, -9], [0, 0, 9], 3.0), "steel")
+    sharp, scattered = (simulate_projections(GEOMETRY, [rod], MONO, detector=d)[0].float() for d in (IDEAL, scanner))
+    assert float(scattered.min()) > float(sharp.min()) + 50

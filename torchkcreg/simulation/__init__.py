@@ -5,6 +5,7 @@
 
 from torchkcreg.simulation.cases import SimulatedCase, weight_bearing_case
 from torchkcreg.simulation.chords import chord_image, chord_lengths
+from torchkcreg.simulation.draws import Draw, draw_case
 from torchkcreg.simulation.hardware import (
     bead_meshes,
     bone_fragments,
@@ -16,12 +17,14 @@ from torchkcreg.simulation.hardware import (
 )
 from torchkcreg.simulation.loads import Load, RodMotion
 from torchkcreg.simulation.parts import Part, material_paths
+from torchkcreg.simulation.population import random_case
 from torchkcreg.simulation.scanner import DetectorModel, simulate_projections
 from torchkcreg.simulation.solids import Cylinder, Sphere, Tube
 
 __all__ = [
     "Cylinder",
     "DetectorModel",
+    "Draw",
     "Load",
     "Part",
     "RodMotion",
@@ -32,11 +35,13 @@ __all__ = [
     "bone_fragments",
     "chord_image",
     "chord_lengths",
+    "draw_case",
     "flared_plate",
     "hole_positions",
     "locking_plate",
     "locking_screws",
     "material_paths",
+    "random_case",
     "screw_mesh",
     "simulate_projections",
     "weight_bearing_case",

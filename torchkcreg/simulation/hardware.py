@@ -26,6 +26,7 @@ def locking_plate(
     hole_radius: float = 2.4,
     end_margin: float = 4.0,
     max_edge: float = 2.5,
+    hole_offset: float = 0.0,
 ) -> trimesh.Trimesh:
     """Watertight mesh of a straight plate with through holes in one row and rounded ends, centred on the origin.
 
@@ -40,6 +41,7 @@ def locking_plate(
         hole_radius: Radius of a hole, mm.
         end_margin: Length of each rounded end, mm; the rest is divided evenly among the holes.
         max_edge: Spacing of the surface's grid lines, mm; triangles' long sides are up to 1.6 times as long.
+        hole_offset: A combination hole is the union of two round ones, this far before and behind its middle, mm.
 
     Raises:
         ValueError: If a hole does not fit into its part of the plate, or a size is not positive.
@@ -51,7 +53,7 @@ def locking_plate(
     for name, value in (("length", length), ("width", width), ("thickness", thickness), ("max_edge", max_edge)):
         if not value > 0:
             raise ValueError(f"{name} must be positive, got {value}")
-    points, triangles = plate_outline(length, width, num_holes, hole_radius, end_margin, max_edge)
+    points, triangles = plate_outline(length, width, num_holes, hole_radius, end_margin, max_edge, hole_offset)
     return _extruded(points, triangles, thickness, max(1, math.ceil(thickness / max_edge)))
 
 

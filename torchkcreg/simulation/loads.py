@@ -136,6 +136,20 @@ class RodMotion:
         moved = (frames[..., :3, :3] @ section[..., None])[..., 0] + frames[..., :3, 3]
         return moved.to(given.dtype) if given.dtype.is_floating_point else moved
 
+    def straightened(self, points: Tensor, *, iterations: int = 20) -> Tensor:
+        """Where points (..., 3) in mm were before the motion, float64: its inverse, near the rod.
+
+        A point lies in the cross section whose plane it is in, `(p - c(z)) . R(z) e_z = 0`; z is found by iteration.
+        """
+        points = points.double()
+        z = points[..., 2]
+        for _ in range(iterations):
+            frames = self.frames(z)
+            z = z + ((points - frames[..., :3, 3]) * frames[..., :3, 2]).sum(-1)
+        frames = self.frames(z)
+        section = (frames[..., :3, :3].mT @ (points - frames[..., :3, 3])[..., None])[..., 0]
+        return torch.cat([section[..., :2], z[..., None]], dim=-1)
+
     def frames(self, z: Tensor) -> Tensor:
         """Frames (..., 4, 4) of the cross sections at z: in its own coordinates a section is at z = 0."""
         interval = torch.searchsorted(self._knots, z.contiguous(), right=True)

@@ -11,11 +11,18 @@ CORNER_SHARE = 0.25  # length of a rounded end at the plate's edges, relative to
 
 
 def plate_outline(
-    length: float, width: float, num_holes: int, hole_radius: float, end_margin: float, max_edge: float
+    length: float,
+    width: float,
+    num_holes: int,
+    hole_radius: float,
+    end_margin: float,
+    max_edge: float,
+    hole_offset: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 2) in (x, z) and triangles (m, 3) of a plate along z with a row of holes and rounded ends.
 
-    All triangles turn the same way. Sizes in mm, as `locking_plate` takes them.
+    All triangles turn the same way. Sizes in mm, as `locking_plate` takes them. A hole is the union of two circles
+    whose centres lie `hole_offset` before and behind its middle.
 
     Raises:
         ValueError: If a hole does not fit into its patch, or the ends leave no room.
@@ -23,18 +30,27 @@ def plate_outline(
     pitch = (length - 2 * end_margin) / max(num_holes, 1)
     if num_holes < 1 or not 0 < end_margin < length / 2:
         raise ValueError(f"num_holes and end_margin must fit a length of {length}, got {num_holes} and {end_margin}")
-    if not 0 < hole_radius < 0.95 * min(pitch, width) / 2:
+    if not (0 < hole_radius < 0.95 * width / 2 and hole_radius + hole_offset < 0.95 * pitch / 2):
         raise ValueError(f"hole_radius must be positive and fit into {pitch:g} x {width:g} mm, got {hole_radius}")
+    if not 0 <= hole_offset < hole_radius:
+        raise ValueError(f"hole_offset must lie between 0 and the hole's radius, got {hole_offset}")
     across, along = math.ceil(width / max_edge), math.ceil(pitch / max_edge)
     centers = [(hole - (num_holes - 1) / 2) * pitch for hole in range(num_holes)]
-    holes = [_hole_patch(center, width, pitch, hole_radius, across, along, max_edge) for center in centers]
+    shape = (hole_radius, hole_offset)
+    holes = [_hole_patch(center, width, pitch, shape, across, along, max_edge) for center in centers]
     start = length / 2 - end_margin
     ends = [_end_patch(side, start, width, end_margin, across, max_edge) for side in (-1, 1)]
     return _merged(holes + ends)
 
 
 def _hole_patch(
-    center: float, width: float, height: float, radius: float, across: int, along: int, max_edge: float
+    center: float,
+    width: float,
+    height: float,
+    shape: tuple[float, float],
+    across: int,
+    along: int,
+    max_edge: float,
 ) -> np.ndarray:
     """Grid (layers + 1, around, 2) from a hole's rim out to its rectangle, the first point repeated at the end."""
     x = np.linspace(-width / 2, width / 2, across + 1)
@@ -48,7 +64,11 @@ def _hole_patch(
         ]
     )
     rectangle = np.concatenate([rectangle, rectangle[:1]])
-    rim = radius * rectangle / np.linalg.norm(rectangle, axis=1, keepdims=True)
+    radius, offset = shape
+    outwards = rectangle / np.linalg.norm(rectangle, axis=1, keepdims=True)
+    # the farther of the two circles along each direction from the middle between their centres
+    reach = offset * np.abs(outwards[:, 1:]) + np.sqrt(radius**2 - (offset * outwards[:, :1]) ** 2)
+    rim = reach * outwards
     layers = math.ceil((math.hypot(width, height) / 2 - radius) / max_edge)
     share = np.linspace(0, 1, layers + 1)[:, None, None]
     return rim + share * (rectangle - rim) + [0.0, center]

@@ -25,7 +25,11 @@ class DetectorModel:
     Attributes:
         scatter_fraction: Scatter behind the object, as a share of the broadly blurred primary.
         scatter_sigma_mm: How broadly, standard deviation on the detector, mm.
+        scatter_removed: Scatter from what the object removes (Ohnesorge et al. 1999): this times the broadly blurred
+            `p ln(1 / p)` of the primary p, with tails three times as wide for a quarter of it.
         psf_sigma_mm: Blur of focal spot and scintillator on the detector, standard deviation, mm.
+        glare_share: Share of the signal that the scintillator spreads farther: the long tail of the blur.
+        glare_sigma_mm: How far, standard deviation, mm.
         open_beam: Counts of the unattenuated beam without scatter.
         photons: Detected photons a pixel of the unattenuated beam; infinite: no quantum noise.
         electronic_noise: Standard deviation, counts.
@@ -38,7 +42,10 @@ class DetectorModel:
 
     scatter_fraction: float = 0.1
     scatter_sigma_mm: float = 25.0
+    scatter_removed: float = 0.0
     psf_sigma_mm: float = 0.25
+    glare_share: float = 0.0
+    glare_sigma_mm: float = 0.8
     open_beam: float = 2800.0
     photons: float = 2e4
     electronic_noise: float = 2.0
@@ -46,7 +53,15 @@ class DetectorModel:
     supersample: int = 2
 
     def __post_init__(self) -> None:
-        for name in ("scatter_fraction", "scatter_sigma_mm", "psf_sigma_mm", "electronic_noise"):
+        for name in (
+            "scatter_fraction",
+            "scatter_sigma_mm",
+            "scatter_removed",
+            "psf_sigma_mm",
+            "glare_share",
+            "glare_sigma_mm",
+            "electronic_noise",
+        ):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         if not (self.open_beam > 0 and self.photons > 0):
@@ -121,20 +136,34 @@ def _primary(
 
 def _detected(primary: Tensor, pixel_spacing: tuple[float, float], detector: DetectorModel) -> Tensor:
     """Blurred primary plus scatter, in units of the open beam."""
-    blurred = primary
+    signal = _spread_out(primary, pixel_spacing, detector.psf_sigma_mm)
+    if detector.glare_share > 0:
+        glare = _spread_out(primary, pixel_spacing, detector.glare_sigma_mm)
+        signal = torch.lerp(signal, glare, detector.glare_share)
+    if detector.scatter_fraction > 0:
+        signal = signal + detector.scatter_fraction * _smooth(primary, pixel_spacing, detector.scatter_sigma_mm)
+    if detector.scatter_removed > 0:
+        source = torch.xlogy(primary, primary).neg()
+        for share, widths in ((0.75, 1.0), (0.25, 3.0)):
+            wide = _smooth(source, pixel_spacing, widths * detector.scatter_sigma_mm)
+            signal = signal + share * detector.scatter_removed * wide
+    return signal
+
+
+def _spread_out(image: Tensor, pixel_spacing: tuple[float, float], sigma_mm: float) -> Tensor:
     for dim, spacing in zip((-2, -1), pixel_spacing):
-        sigma = torch.tensor(detector.psf_sigma_mm / spacing, dtype=torch.float64)
-        blurred = convolve(blurred, gaussian_kernel(sigma).tolist(), dim)
-    if detector.scatter_fraction == 0:
-        return blurred
-    rows, cols = primary.shape
+        sigma = torch.tensor(sigma_mm / spacing, dtype=torch.float64)
+        image = convolve(image, gaussian_kernel(sigma).tolist(), dim)
+    return image
+
+
+def _smooth(image: Tensor, pixel_spacing: tuple[float, float], sigma_mm: float) -> Tensor:
+    """An image (rows, cols) blurred broadly, on blocks of pixels."""
+    rows, cols = image.shape
     coarse_shape = (max(1, rows // SCATTER_BLOCK), max(1, cols // SCATTER_BLOCK))
-    coarse = adaptive_avg_pool2d(primary[None, None], coarse_shape)
-    coarse_sigma = detector.scatter_sigma_mm / (sum(pixel_spacing) / 2) / SCATTER_BLOCK
-    smooth = interpolate(gaussian_blur(coarse, coarse_sigma), size=(rows, cols), mode="bilinear", align_corners=False)[
-        0, 0
-    ]
-    return blurred + detector.scatter_fraction * smooth
+    coarse = adaptive_avg_pool2d(image[None, None], coarse_shape)
+    smooth = gaussian_blur(coarse, sigma_mm / (sum(pixel_spacing) / 2) / SCATTER_BLOCK)
+    return interpolate(smooth, size=(rows, cols), mode="bilinear", align_corners=False)[0, 0]
 
 
 def _counts(signal: Tensor, detector: DetectorModel, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,201 @@
+"""Registrations of a random population of simulated cases: errors, and what the verdict missed of them.
+
+    python benchmarks/population.py                      # 40 cases, three neighbouring views, about 20 minutes
+    python benchmarks/population.py --views around --known
+
+Rows are written as they come; a run that was broken off goes on where it stopped. The cases are those of
+`torchkcreg.simulation.random_case`; two are registered at a time, with a thread each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import matplotlib  # noqa: E402
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from tqdm import tqdm  # noqa: E402
+
+from torchkcreg.evaluation import bb_rmse  # noqa: E402
+from torchkcreg.experiments.capture import registration_inputs  # noqa: E402
+from torchkcreg.implant import find_holes  # noqa: E402
+from torchkcreg.registration import Callback, RegistrationConfig, Trainer, build_scene  # noqa: E402
+from torchkcreg.registration.result import RegistrationResult  # noqa: E402
+from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case  # noqa: E402
+
+WRONG_MM, RIGHT_MM = 0.15, 0.10
+
+
+class _ErrorsOfStages(Callback):
+    """Node RMSE after each stage, and the loss there."""
+
+    def __init__(self, nodes: torch.Tensor, truth: torch.Tensor) -> None:
+        self.nodes, self.truth = nodes, truth
+        self.errors: list[str] = []
+
+    def on_stage_end(self, trainer: Trainer, index: int, stage: Any) -> None:
+        scene = trainer.scene
+        with torch.no_grad():
+            moved = self.nodes + scene.deformation.displacement(self.nodes)
+        pose = scene.implant_to_world
+        error = float(bb_rmse(moved @ pose[:3, :3].T + pose[:3, 3], self.truth))
+        self.errors.append(f"{error:.3f}/{trainer.history[-1]['loss']:.4f}")
+
+
+def register_case(case: SimulatedCase, draw: Draw, known: bool, options: dict[str, Any]) -> dict[str, Any]:
+    """The row of one case: errors in mm and what the registration says of itself."""
+    config = RegistrationConfig(material=case.implant_material, **options)
+    data, cloud, screws = registration_inputs(case, config.pitch_mm)
+    nodes = cloud.coarsened(8).points.double()
+    truth = case.deform(nodes)
+    start = time.perf_counter()
+    scene = build_scene(
+        cloud,
+        config,
+        spectrum=case.spectrum if known else None,
+        components=screws if known else (),
+        holes=find_holes(case.implant),
+    )
+    trace = _ErrorsOfStages(nodes, truth)
+    result = Trainer(scene, data, config, callbacks=[trace]).fit()
+    errors = result.warp(nodes) - truth
+    ray = case.geometry.source_positions.double().mean(0) - nodes.mean(0)
+    depth = errors @ (ray / ray.norm())
+    beads = float(bb_rmse(result.warp(case.beads_before.double()), case.beads_after.double()))
+    node, largest = float(bb_rmse(errors, torch.zeros_like(errors))), float(errors.norm(dim=-1).max()) / 3
+    return {
+        "seed": draw.seed,
+        "beads": round(beads, 4),
+        "nodes": round(node, 4),
+        "largest_third": round(largest, 4),
+        "worst": round(max(beads, node, largest), 4),
+        "depth": round(float(depth.square().mean().sqrt()), 4),
+        "gc": round(float(result.gc.mean()), 4),
+        "status": _status(result),
+        "warnings": "; ".join(result.warnings),
+        "seconds": round(time.perf_counter() - start, 1),
+        "azimuth": draw.azimuth_deg,
+        "scatter": round(draw.detector.scatter_fraction + draw.detector.scatter_removed, 3),
+        "kind": f"{draw.material} {draw.screw_material} {draw.scanner} {draw.kvp} kV water {draw.water_radius:.0f}",
+        "physics": " ".join(f"{name}={value:.3f}" for name, value in result.intensity.items()),
+        "stages": " ".join(trace.errors),
+    }
+
+
+def _status(result: RegistrationResult) -> str:
+    return getattr(result, "status", "ok")
+
+
+def _job(job: tuple[int, str, bool, dict[str, Any], str]) -> dict[str, Any]:
+    seed, views, known, options, cache = job
+    torch.set_num_threads(1)
+    draw = draw_case(seed)
+    kept = Path(cache) / f"{views}-{seed}.npy" if cache else None
+    case = random_case(draw, views=views, counts=_load(kept))
+    if kept is not None and not kept.exists():
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        np.save(kept, case.intensity.numpy())
+    try:
+        return register_case(case, draw, known, options)
+    except (ValueError, RuntimeError) as error:
+        return {"seed": seed, "status": "failed", "warnings": f"{type(error).__name__}: {error}", "worst": float("inf")}
+
+
+def _load(path: Path | None) -> torch.Tensor | None:
+    return torch.from_numpy(np.load(path)) if path is not None and path.exists() else None
+
+
+def rows_of(path: Path, jobs: list[tuple[int, str, bool, dict[str, Any], str]]) -> Iterator[dict[str, Any]]:
+    """Rows of all jobs, those that the table has already first; new ones are appended to it."""
+    done = _read(path)
+    yield from done.values()
+    left = [job for job in jobs if job[0] not in done]
+    with multiprocessing.get_context("spawn").Pool(2, maxtasksperchild=4) as pool:
+        for row in tqdm(pool.imap_unordered(_job, left), total=len(left), desc="cases"):
+            with path.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+            tqdm.write(" ".join(str(row.get(k, "")) for k in ("seed", "worst", "nodes", "gc", "status", "stages")))
+            yield row
+
+
+def _read(path: Path) -> dict[int, dict[str, Any]]:
+    lines = path.read_text().splitlines() if path.exists() else []
+    return {row["seed"]: row for row in map(json.loads, lines)}
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """The figures that matter, in one line."""
+    worst = np.array([row["worst"] for row in rows])
+    nodes = np.array([row.get("nodes", np.inf) for row in rows])
+    said = np.array([row["status"] != "ok" or bool(row["warnings"]) for row in rows])
+    silent = [row["seed"] for row, s in zip(rows, said, strict=True) if not s and row["worst"] > WRONG_MM]
+    idle = [row["seed"] for row, s in zip(rows, said, strict=True) if s and row["worst"] < RIGHT_MM]
+    right = int((worst < RIGHT_MM).sum())
+    seconds = np.median([row.get("seconds", np.nan) for row in rows])
+    return (
+        f"{len(rows)} cases: node RMSE median {np.median(nodes):.3f}, worst figure median {np.median(worst):.3f}, "
+        f"90th percentile {np.percentile(worst, 90):.3f} mm; {right} below {RIGHT_MM} mm; "
+        f"silent failures {len(silent)} {silent}; idle alarms {len(idle)} {idle}; {seconds:.0f} s"
+    )
+
+
+def draw_plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Errors against azimuth, scatter and gradient correlation; what the verdict doubts is hollow."""
+    rows = [row for row in rows if np.isfinite(row["worst"])]
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharey=True, layout="constrained")
+    names = {"azimuth": "gantry angle (degrees; 90: face on)", "scatter": "scatter", "gc": "gradient correlation"}
+    for axis, (name, label) in zip(axes, names.items(), strict=True):
+        for status, face in (("ok", "#0072B2"), ("doubtful", "none"), ("failed", "none")):
+            shown = [row for row in rows if row["status"] == status]
+            edge = {"ok": "#0072B2", "doubtful": "#E69F00", "failed": "#D55E00"}[status]
+            x, y = [row[name] for row in shown], [row["worst"] for row in shown]
+            axis.scatter(x, y, s=28, facecolors=face, edgecolors=edge, label=status)
+        axis.axhline(RIGHT_MM, color="0.8", zorder=0)
+        axis.set(xlabel=label, yscale="log")
+    axes[0].set_ylabel("largest of bead RMSE,\nnode RMSE, node maximum / 3 (mm)")
+    axes[2].legend(frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Writes table, summary and plot."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--seeds", type=lambda text: [int(s) for s in text.split(",")], help="these seeds alone")
+    parser.add_argument("--views", choices=("neighbours", "around", "both"), default="neighbours")
+    parser.add_argument("--known", action="store_true", help="screws and spectrum are told")
+    parser.add_argument("--options", type=json.loads, default={}, help="options of the registration as JSON")
+    parser.add_argument("--cache", default="", help="folder that keeps the images")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    name = f"population-{options.views}-{'known' if options.known else 'plain'}"
+    seeds = options.seeds or range(options.first, options.first + options.cases)
+    jobs = [(seed, options.views, options.known, options.options, options.cache) for seed in seeds]
+    rows = sorted(rows_of(options.out / f"{name}.jsonl", jobs), key=lambda row: row["seed"])
+    with (options.out / f"{name}.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, max(rows, key=len), extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    draw_plot(rows, options.out / f"{name}.png")
+    print(summary(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,214 @@
+"""Random weight-bearing cases: plates, screws, limbs, spectra, scanners and loads as various as those of a clinic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid, rigid_matrix
+from torchkcreg.physics import tungsten_spectrum
+from torchkcreg.simulation.cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase
+from torchkcreg.simulation.draws import Draw, draw_case
+from torchkcreg.simulation.hardware import Screw, locking_plate
+from torchkcreg.simulation.loads import Load, RodMotion
+from torchkcreg.simulation.parts import Part
+from torchkcreg.simulation.scanner import simulate_projections
+from torchkcreg.simulation.solids import Cylinder, Sphere, Tube
+
+ViewSet = Literal["neighbours", "around", "both"]
+_SOFTENING_MM = 4.0  # over which a plate's curvature sets in beside a screw that holds it
+
+
+def random_case(seed: int | Draw, *, views: ViewSet = "neighbours", counts: Tensor | None = None) -> SimulatedCase:
+    """A case of the population: its images and the truth about it.
+
+    Args:
+        seed: Names the case; or what was drawn, changed as you like.
+        views: Three neighbouring views, a focal spot each; six around the limb; or both, in this order.
+        counts: The images, where they have been kept: making them takes seconds.
+    """
+    draw = seed if isinstance(seed, Draw) else draw_case(seed)
+    rest, loaded = motions(draw)
+    straight = _straight_plate(draw)
+
+    def deform(points: Tensor) -> Tensor:
+        return loaded(rest.straightened(points)).to(points.dtype)
+
+    listed, in_beam = _screws(draw, rest, loaded)
+    beads = _bead_positions(draw)
+    parts = [Part("plate", _mapped(straight, loaded), draw.material, inside=_tissue(draw)), *in_beam]
+    parts += _limb(draw, loaded)
+    parts += [
+        Part(f"bead{n}", Sphere(center, BEAD_RADIUS), "steel", inside=_tissue(draw))
+        for n, center in enumerate(loaded(beads))
+    ]
+    geometry = view_geometry(draw, views)
+    spectrum = tungsten_spectrum(draw.kvp)
+    if counts is None:
+        counts = simulate_projections(geometry, parts, spectrum, detector=draw.detector, seed=draw.seed)
+    return SimulatedCase(
+        geometry=geometry,
+        implant=_mapped(straight, rest),
+        implant_material=draw.material,
+        screws=listed,
+        beads_before=rest(beads),
+        beads_after=loaded(beads),
+        deform=deform,
+        intensity=counts,
+        open_beam=draw.detector.open_beam,
+        saturation=draw.detector.saturation,
+        spectrum=spectrum,
+        load=Load(bend_deg=draw.bend_deg, s_bend_deg=draw.s_bend_deg, torsion_deg=draw.torsion_deg),
+        parts=parts,
+    )
+
+
+def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
+    """The views of a case, on the part of the panel behind the limb."""
+    spots = {"T1": 120.0, "T2": 0.0, "T3": -120.0}
+    scanner = MultisourceScanner()
+    if draw.scanner == "c-arm":
+        spots = {"T1": 40.0, "T2": 0.0, "T3": -40.0}
+        scanner = replace(scanner, sad=620.0, sdd=1050.0)
+    near = [draw.azimuth_deg + step for step in range(3)] if views != "around" else []
+    around = [draw.azimuth_deg + 30.0 * step + 10.0 for step in range(6)] if views != "neighbours" else []
+    angles = [*near, *around]
+    names = [f"T{1 + index % 3}" for index in range(len(angles))]
+    whole = [
+        replace(scanner, num_views=1, start_deg=angle, phase_deg=angle, firing_order=(name,), source_z_mm=spots)
+        for angle, name in zip(angles, names, strict=True)
+    ]
+    geometries = [one.geometry() for one in whole]
+    cols = 320 if draw.scanner == "c-arm" else 256
+    left = (scanner.det_shape[1] - cols) // 2
+    joined = ConeBeamGeometry(
+        torch.cat([g.projection_matrices for g in geometries]),
+        scanner.det_shape,
+        scanner.pixel_spacing,
+        sources=names,
+        angles_deg=angles,
+    )
+    return joined.crop(slice(32, scanner.det_shape[0] - 32), slice(left, left + cols))
+
+
+def motions(draw: Draw) -> tuple[RodMotion, RodMotion]:
+    """From the straight plate to the undeformed one, and to the loaded one."""
+    half = draw.length / 2
+    bow = torch.deg2rad(torch.tensor([draw.bow_deg, 0.0, draw.twist_deg], dtype=torch.float64)) / draw.length
+    held = [z for i, z in enumerate(draw.hole_heights[hole] for hole in draw.holes_used) if i != draw.loose]
+    low, high = max(z for z in held if z < 0), min(z for z in held if z > 0)
+    middle, reach = (low + high) / 2, (high - low) / 2
+
+    def loaded(z: Tensor) -> Tensor:
+        relative = (z - middle) / reach
+        inside = ((reach - (z - middle).abs()) / _SOFTENING_MM).clamp(0, 1) / (2 * reach - _SOFTENING_MM)
+        angles = (draw.bend_deg, draw.lateral_deg, draw.torsion_deg)
+        bend, lateral, torsion = (math.radians(angle) * inside for angle in angles)
+        bend = bend - 4 * math.radians(draw.s_bend_deg) * relative * inside
+        return torch.stack([bend, lateral, torsion], dim=-1) + bow
+
+    stretch = (-half, half)
+    rest = RodMotion(lambda z: bow.expand(len(z), 3), stretch)
+    nodes = torch.cartesian_prod(*(torch.linspace(-x, x, n).double() for x, n in zip((6.0, 2.0, half), (2, 2, 65))))
+    turn = torch.deg2rad(torch.tensor(draw.turn_deg, dtype=torch.float64))
+    misaligned = rigid_matrix(turn, torch.tensor(draw.shift, dtype=torch.float64))
+    common = fit_rigid(rest(nodes), RodMotion(loaded, stretch)(nodes))
+    return rest, RodMotion(loaded, stretch, misaligned @ torch.linalg.inv(common))
+
+
+def _straight_plate(draw: Draw) -> trimesh.Trimesh:
+    plate = locking_plate(
+        length=draw.length,
+        width=draw.width,
+        thickness=draw.thickness,
+        num_holes=draw.num_holes,
+        hole_radius=2.4,
+        hole_offset=draw.hole_offset,
+        max_edge=2.0,
+    )
+    share = ((plate.vertices[:, 2] / draw.length - 0.05) / 0.35).clip(0, 1)
+    plate.vertices[:, 0] *= 1 + (draw.flare - 1) * share**2 * (3 - 2 * share)
+    return plate
+
+
+def _screws(draw: Draw, rest: RodMotion, loaded: RodMotion) -> tuple[list[Screw], list[Part]]:
+    """Screws as a list of them says, at rest, and as they stand in the beam, with heads that no list knows."""
+    rng = np.random.default_rng([draw.seed, 21])
+    listed: list[Screw] = []
+    parts = []
+    top, tissue = draw.thickness / 2, _tissue(draw)
+    for number, hole in enumerate(draw.holes_used):
+        height = draw.hole_heights[hole]
+        z = torch.tensor([height], dtype=torch.float64)
+        direction = rng.normal(size=2)
+        tilt = math.radians(rng.uniform(0.4, 1.0) * draw.tilt_deg) * direction / np.linalg.norm(direction)
+        offset = draw.hole_offset if rng.random() < 0.5 else -draw.hole_offset
+        length, radius = float(rng.uniform(26.0, 40.0)), float(rng.uniform(1.6, 2.2))
+        axis = torch.tensor([math.sin(tilt[0]), -1.0, math.sin(tilt[1])], dtype=torch.float64)
+        head = torch.tensor([0.0, top, offset], dtype=torch.float64)
+        tip = head + length * axis / axis.norm()
+        ends = torch.stack([head, tip])
+        fragment = FRAGMENTS[0] if height < 0 else FRAGMENTS[1]
+        before, after = (motion.frames(z)[0] for motion in (rest, loaded))
+        start, end = ends @ before[:3, :3].T + before[:3, 3]
+        listed.append(
+            {"from": start.tolist(), "to": end.tolist(), "radius": radius, "material": draw.screw_material}
+            | {"fragment": fragment}  # type: ignore[arg-type]
+        )
+        shaft = ends @ after[:3, :3].T + after[:3, 3]
+        parts.append(
+            Part(f"screw{number}", Cylinder(shaft[0], shaft[1], radius), draw.screw_material, (fragment,), tissue)
+        )
+        if draw.heads:
+            cap = torch.stack([head, head + torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64)])
+            cap = cap @ after[:3, :3].T + after[:3, 3]
+            parts.append(Part(f"head{number}", Cylinder(cap[0], cap[1], 1.7 * radius), draw.screw_material, (), tissue))
+    return listed, parts
+
+
+def _limb(draw: Draw, loaded: RodMotion) -> list[Part]:
+    """The bone's two fragments, each where its screws take it, and the water around them."""
+    depth = -(draw.thickness / 2 + 1.5 + draw.bone_radius)
+    parts, tissue = [], _tissue(draw)
+    for fragment, side in zip(FRAGMENTS, (-1.0, 1.0), strict=True):
+        heights = [draw.hole_heights[hole] for hole in draw.holes_used]
+        held = [z for i, z in enumerate(heights) if z * side > 0 and i != draw.loose]
+        points = torch.tensor([[x, y, z] for z in held for x in (-3.0, 3.0) for y in (0.0, depth)]).double()
+        motion = fit_rigid(points, loaded(points))
+        near = torch.tensor([0.0, depth, side * GAP / 2], dtype=torch.float64)
+        far = torch.tensor([0.0, depth, side * 160.0], dtype=torch.float64)
+        bone = Tube(near, far, draw.bone_radius, draw.bone_radius - draw.cortex).moved(motion)
+        parts.append(Part(fragment, bone, "cortical_bone", inside=tissue))
+        if draw.marrow:
+            core = Cylinder(near, far, draw.bone_radius - draw.cortex - 1e-3).moved(motion)
+            parts.append(Part(f"{fragment} marrow", core, "cancellous_bone", inside=tissue))
+    if tissue is not None:
+        ends = torch.tensor([[0.0, depth, -170.0], [0.0, depth, 170.0]], dtype=torch.float64)
+        parts.append(Part(tissue, Cylinder(ends[0], ends[1], draw.water_radius), "water"))
+    return parts
+
+
+def _tissue(draw: Draw) -> str | None:
+    return "tissue" if draw.water_radius else None
+
+
+def _bead_positions(draw: Draw) -> Tensor:
+    """Centres (8, 3) of beads beside the straight plate, in sections that its outer screws hold."""
+    group = torch.tensor([[11.0, 2.0, 4.0], [-11.0, -2.0, 8.0], [10.0, -3.0, 14.0], [-10.0, 3.0, 19.0]]).double()
+    low, high = (draw.hole_heights[hole] for hole in (draw.holes_used[0], draw.holes_used[-1]))
+    below = group * torch.tensor([1.0, 1.0, -1.0]) + torch.tensor([0.0, 0.0, low + 4.0])
+    above = group * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([0.0, 0.0, high - 4.0])
+    return torch.cat([below, above])
+
+
+def _mapped(mesh: trimesh.Trimesh, mapping: Callable[[Tensor], Tensor]) -> trimesh.Trimesh:
+    """The mesh with every vertex moved."""
+    vertices = mapping(torch.tensor(np.asarray(mesh.vertices), dtype=torch.float64))
+    return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)
