@@ -1,6 +1,6 @@
 """Registration: the objective, its optimisers and the coarse-to-fine loop."""
 
-from .background import estimate_background
+from .background import with_background
 from .callbacks import Callback, ProgressBar
 from .config import RegistrationConfig, Stage, preset_stages
 from .data import RegistrationData
@@ -24,9 +24,9 @@ __all__ = [
     "StageObjective",
     "Trainer",
     "build_scene",
-    "estimate_background",
     "find_screws",
     "preset_stages",
     "register",
     "stage_objective",
+    "with_background",
 ]

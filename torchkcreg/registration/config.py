@@ -36,8 +36,9 @@ class Stage(BaseModel):
         screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
             or those found before have their lengths and radius estimated along ("fit").
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
-        estimate: Parameters of the intensity model that are estimated along; hardness only where the spectrum was not
-            given.
+        contrast: The images' contrast counts too (:class:`torchkcreg.similarity.GradientDifference`), not only its
+            shape (gradient correlation).
+        estimate: Parameters of the intensity model that are estimated along, with priors about where they start.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -57,6 +58,7 @@ class Stage(BaseModel):
     slide: bool = False
     screws: Literal["find", "fit"] | None = None
     robust: bool = False
+    contrast: bool = False
     estimate: tuple[NuisanceName, ...] = ()
 
     @model_validator(mode="after")
@@ -87,23 +89,15 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         margin_mm=25.0,
         slide=True,
     )
-    physics: tuple[NuisanceName, ...] = ("scatter", "blur")
+    physics: tuple[NuisanceName, ...] = ("scatter", "blur", "hardness")
+    seen = {"pitch_factor": 2, "background": True, "contrast": True}
     levels = [
         Stage(bin=8, pitch_factor=4, screws="find"),
-        Stage(bin=4, pitch_factor=2, screws="find"),
-        Stage(groups=2, bin=4, pitch_factor=2, screws="find"),
-        Stage(groups=2, bin=2, pitch_factor=2, estimate=physics, screws="fit"),
-        Stage(groups=20, modes=40, bin=2, pitch_factor=2, estimate=physics, background=True, screws="fit"),
-        Stage(
-            groups=20,
-            modes=40,
-            bin=1,
-            pitch_factor=2,
-            estimate=physics,
-            background=True,
-            robust=True,
-            screws="fit",
-        ),
+        Stage(bin=4, screws="find", estimate=("scatter", "hardness"), **seen),
+        Stage(groups=2, bin=4, screws="find", estimate=physics, **seen),
+        Stage(groups=2, bin=2, estimate=physics, robust=True, screws="fit", **seen),
+        Stage(groups=20, modes=40, bin=2, estimate=physics, robust=True, screws="fit", **seen),
+        Stage(groups=20, modes=40, bin=1, estimate=physics, robust=True, screws="fit", **seen),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
@@ -138,6 +132,8 @@ class RegistrationConfig(BaseModel):
             over Young's modulus. That is half a squared strain: 30 charges 1e-5 of GC for strains of 1e-3, where steel
             yields, and 1e-3 for strains of 1e-2.
         load_weight: Loss for a load of 1 kN along an elastic mode, in stages of modes; it grows with the load's square.
+        prior_weight: Loss for a parameter of the intensity model that is a standard deviation off where it most likely
+            is; it grows with the square.
         youngs_modulus_gpa: Young's modulus of the implant, GPa. The default is that of steel; only its square times
             ``load_weight`` counts, and the order of magnitude of that.
         scatter: Initial scatter, as a fraction of the measured signal about a pixel.
@@ -162,12 +158,13 @@ class RegistrationConfig(BaseModel):
     beta: float = Field(1e-4, ge=0)
     stiffness: float = Field(30.0, ge=0)
     load_weight: float = Field(1e-9, ge=0)
+    prior_weight: float = Field(5e-4, ge=0)
     youngs_modulus_gpa: float = Field(200.0, gt=0)
     scatter: float = Field(0.08, ge=0, lt=1)
     scatter_mm: float = Field(25.0, gt=0)
     blur_px: float = Field(0.7, ge=0)
     background_mm: float = Field(4.0, gt=0)
-    background_material: str = "cortical_bone"
+    background_material: str = "soft_tissue"
     find_screws: bool = True
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +26,8 @@ class RegistrationData:
         mask: True where a pixel counts, shape (V, rows, cols); all pixels when None was given.
         background: Path length of what the known components lack (bone, water) through one material that stands for
             it, shape (V, rows, cols), mm; None where nothing is known of it.
+        background_slopes: How the background's estimate changes with parameters of the intensity model, by name, each
+            of shape (V, rows, cols), mm a unit of the parameter.
         scatter_shape: How scatter is spread over the detector, shape (V, rows, cols); evenly if None.
 
     Raises:
@@ -34,6 +38,7 @@ class RegistrationData:
     line_integrals: Tensor
     mask: Tensor = None  # type: ignore[assignment]  # set below
     background: Tensor | None = None
+    background_slopes: Mapping[str, Tensor] = field(default_factory=dict)
     scatter_shape: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -63,8 +68,9 @@ class RegistrationData:
 
     def select(self, views: list[int]) -> RegistrationData:
         """The given views alone, in the given order."""
-        images = {name: image[views] for name, image in self._images().items()}
-        return replace(self, geometry=self.geometry.select(views), **images)
+        estimates = self._estimates(lambda image: image[views])
+        lines, mask = self.line_integrals[views], self.mask[views]
+        return replace(self, geometry=self.geometry.select(views), line_integrals=lines, mask=mask, **estimates)
 
     def binned(self, factor: int) -> RegistrationData:
         """Data on pixels ``factor`` times as large: transmissions are averaged over the pixels that count.
@@ -81,8 +87,7 @@ class RegistrationData:
         share = mean(self.mask.float())
         transmission = mean(torch.exp(-self.line_integrals) * self.mask) / share.clamp_min(1e-6)
         line_integrals = -torch.log(transmission.clamp_min(1e-6))
-        estimates = {name: mean(image) for name, image in self._estimates().items()}
-        return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5, **estimates)
+        return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5, **self._estimates(mean))
 
     def windowed(self, points: Tensor, margin_px: float) -> RegistrationData:
         """Data cropped, view by view, to the projection of ``points`` and a margin.
@@ -107,14 +112,18 @@ class RegistrationData:
         low = torch.minimum(torch.maximum(low, torch.zeros_like(low)), limit).long()
         high = torch.maximum(torch.minimum(high, limit), low.to(high)).long()
         size_u, size_v = (high - low + 1).amax(dim=0).tolist()
-        windows = {name: image.new_zeros(self.num_views, size_v, size_u) for name, image in self._images().items()}
         matrices = self.geometry.projection_matrices.clone()
         for view, (u0, v0) in enumerate(low.tolist()):
-            height, width = min(size_v, rows - v0), min(size_u, cols - u0)
-            for name, image in self._images().items():
-                windows[name][view, :height, :width] = image[view, v0 : v0 + height, u0 : u0 + width]
             matrices[view, 0] -= u0 * matrices[view, 2]
             matrices[view, 1] -= v0 * matrices[view, 2]
+
+        def window(image: Tensor) -> Tensor:
+            cut = image.new_zeros(self.num_views, size_v, size_u)
+            for view, (u0, v0) in enumerate(low.tolist()):
+                height, width = min(size_v, rows - v0), min(size_u, cols - u0)
+                cut[view, :height, :width] = image[view, v0 : v0 + height, u0 : u0 + width]
+            return cut
+
         geometry = ConeBeamGeometry(
             matrices,
             (size_v, size_u),
@@ -122,7 +131,8 @@ class RegistrationData:
             sources=self.geometry.sources,
             angles_deg=self.geometry.angles_deg,
         )
-        return RegistrationData(geometry, **windows)
+        estimates = self._estimates(window)
+        return RegistrationData(geometry, window(self.line_integrals), window(self.mask), **estimates)
 
     def with_scatter_shape(self, sigma_mm: float) -> RegistrationData:
         """The data with a shape of the scatter: the measured transmission, blurred by ``sigma_mm`` at the detector.
@@ -140,12 +150,11 @@ class RegistrationData:
         rows, cols = self.geometry.det_shape
         return max(1, rows // factor), max(1, cols // factor)
 
-    def _estimates(self) -> dict[str, Tensor]:
-        estimates = {"background": self.background, "scatter_shape": self.scatter_shape}
-        return {name: image for name, image in estimates.items() if image is not None}
-
-    def _images(self) -> dict[str, Tensor]:
-        return {"line_integrals": self.line_integrals, "mask": self.mask, **self._estimates()}
+    def _estimates(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+        """What is estimated about the images, each image changed."""
+        known = {"background": self.background, "scatter_shape": self.scatter_shape}
+        changed = {name: None if image is None else change(image) for name, image in known.items()}
+        return {**changed, "background_slopes": {name: change(image) for name, image in self.background_slopes.items()}}
 
 
 def resized(images: Tensor, det_shape: tuple[int, int]) -> Tensor:

@@ -73,8 +73,7 @@ class StageModel:
         self._prepare_motion()
         self._prepare_clouds()
         self._prepare_images(data)
-        estimate = [name for name in stage.estimate if name != "hardness" or not scene.knows_spectrum]
-        self.nuisance = Nuisance(scene.intensity, estimate, stage.bin / stage.oversampling)
+        self.nuisance = Nuisance(scene, config, stage.estimate, stage.bin / stage.oversampling)
         if scene.found and stage.screws == "fit":
             self.screws = ScrewShapes(scene.found, self.screw_path)
         shapes = self.screws.num_parameters if self.screws else 0
@@ -129,6 +128,7 @@ class StageModel:
         self.matrices, self.det_shape = fine.projection_matrices.float(), fine.det_shape
         behind = self.data.background
         self.background = None if behind is None else resized(behind, fine.det_shape)
+        self.background_slopes = {n: resized(x, fine.det_shape) for n, x in self.data.background_slopes.items()}
         cell = self.implant.cell.float() @ self.scene.implant_to_world[:3, :3].float().T
         self.footprints = [cell_footprint(points[0], cell, self.matrices) for points in at_start]
 
@@ -188,9 +188,17 @@ class StageModel:
         if self.screws:
             paths[0] = paths[0] + self.screws(self.split(parameters)[2])
         if self.scene.is_polyenergetic:
-            unknown = torch.zeros(()) if self.background is None else self.background
-            paths.append(unknown.expand_as(paths[0]))
+            paths.append(self._unknown(parameters).expand_as(paths[0]))
         return torch.stack(paths, dim=-4)
+
+    def _unknown(self, parameters: Tensor) -> Tensor:
+        """Path lengths of the background, which follows the parameters of the intensity model."""
+        if self.background is None:
+            return torch.zeros(())
+        unknown, steps = self.background, self.split(parameters)[1]
+        for name, slope in self.background_slopes.items():
+            unknown = unknown + self.nuisance.change(steps, name).to(slope)[:, None, None, None] * slope
+        return unknown
 
     @torch.no_grad()
     def screw_path(self, screw: FoundScrew) -> Tensor:

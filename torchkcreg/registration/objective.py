@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.deformation import control_points_from_groups, diffusion_penalty
-from torchkcreg.similarity import GradientCorrelation, sobel_gradient
+from torchkcreg.similarity import GradientCorrelation, GradientDifference, sobel_gradient
 
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
@@ -32,7 +32,8 @@ class StageObjective:
         self.scene, self.config = scene, config
         self.model = StageModel(scene, data, stage, config)
         self.num_parameters = self.model.num_parameters
-        self.similarity = GradientCorrelation(self.model.data.line_integrals, self.model.data.mask)
+        self.measure = GradientDifference if stage.contrast and scene.is_polyenergetic else GradientCorrelation
+        self.similarity = self.measure(self.model.data.line_integrals, self.model.data.mask)
         if stage.robust:
             self._reweight()
 
@@ -49,12 +50,13 @@ class StageObjective:
         in many places: between the screws that load it a plate is free.
         """
         motion = self.model.motion
+        physics = self.config.prior_weight * self.model.nuisance.penalty(self.model.split(parameters)[1])
         if isinstance(motion, ModalMotion):
             loads = self.config.youngs_modulus_gpa * motion.loads(self.model.split(parameters)[0])
-            return self.config.load_weight * loads.square().sum(-1)
+            return physics + self.config.load_weight * loads.square().sum(-1)
         diffusion = diffusion_penalty(self.control_points(parameters), self.scene.deformation.grid)
         elastic = self.model.elasticity.energy(self.model.motion_steps(parameters))
-        return self.config.beta * diffusion + self.config.stiffness * elastic
+        return physics + self.config.beta * diffusion + self.config.stiffness * elastic
 
     @torch.no_grad()
     def _reweight(self) -> None:
@@ -62,7 +64,7 @@ class StageObjective:
         images = model.line_integrals(model.at_rest)
         residuals = self.similarity.residuals(images)[0]
         weights = residual_weights(residuals, sobel_gradient(images)[0], model.data.mask)
-        self.similarity = GradientCorrelation(model.data.line_integrals, model.data.mask, weights)
+        self.similarity = self.measure(model.data.line_integrals, model.data.mask, weights)
 
     def project(self, parameters: Tensor) -> Tensor:
         """Candidates with the parameters of intensity model and screws inside their bounds."""

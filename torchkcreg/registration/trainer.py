@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import torch
 
 from torchkcreg.geometry import transform_points
 
-from .background import estimate_background
+from .background import with_background
 from .callbacks import Callback
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
@@ -28,7 +28,8 @@ def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: 
     """The objective of a stage at the scene's present state, with the background that the stage asks for."""
     data = with_scatter_shape(scene, data, config)
     if stage.background and scene.is_polyenergetic:
-        data = replace(data, background=estimate_background(scene, data, config))
+        follows = [name for name in stage.estimate if name != "blur"]
+        data = with_background(scene, data, config, follows=follows)
     return StageObjective(scene, data, stage, config)
 
 

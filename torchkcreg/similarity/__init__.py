@@ -6,12 +6,14 @@ from torchkcreg.similarity.gradient_correlation import (
     GradientCorrelationLoss,
     gradient_correlation,
 )
+from torchkcreg.similarity.gradient_difference import GradientDifference
 from torchkcreg.similarity.ncc import normalized_cross_correlation
 from torchkcreg.similarity.sobel import erode_mask, sobel_gradient
 
 __all__ = [
     "GradientCorrelation",
     "GradientCorrelationLoss",
+    "GradientDifference",
     "erode_mask",
     "gradient_correlation",
     "normalized_cross_correlation",

@@ -40,12 +40,12 @@ def gradient_correlation(moving: Tensor, fixed: Tensor, *, mask: Tensor | None =
         tensor([[ 1.,  1.],
                 [-1., -1.]])
     """
-    _check_images(moving, fixed)
+    check_images(moving, fixed)
     if mask is not None:
         _check_mask(mask, fixed)
     eroded = None if mask is None else erode_mask(mask)
     unit_fixed = _unit_gradients(fixed, mask, eroded)
-    return _in_blocks(lambda block: _correlate(block, unit_fixed, mask, eroded), moving, whole=fixed.ndim > 3)
+    return in_blocks(lambda block: _correlate(block, unit_fixed, mask, eroded), moving, whole=fixed.ndim > 3)
 
 
 class GradientCorrelation(nn.Module):
@@ -78,21 +78,7 @@ class GradientCorrelation(nn.Module):
 
     def __init__(self, fixed: Tensor, mask: Tensor | None = None, weights: Tensor | None = None) -> None:
         super().__init__()
-        if fixed.ndim != 3:
-            raise ValueError(f"fixed must have shape (V, rows, cols), got {tuple(fixed.shape)}")
-        if mask is not None:
-            _check_mask(mask, fixed)
-            mask = mask.detach() != 0
-        counted = torch.isfinite(fixed) if mask is None else torch.isfinite(fixed) | ~mask
-        if not counted.all():
-            raise ValueError(f"fixed must be finite where it counts, got {int((~counted).sum())} pixels that are not")
-        eroded = None if mask is None else erode_mask(mask)
-        if weights is not None:
-            _check_mask(weights, fixed)
-            if not bool((weights >= 0).all()):
-                raise ValueError("weights must not be negative")
-            weights = weights.detach().to(fixed.dtype)
-            eroded = weights if eroded is None else eroded * weights
+        mask, eroded = weights_of_pixels(fixed, mask, weights)
         self.register_buffer("mask", mask)
         self.register_buffer("eroded_mask", eroded)
         self.register_buffer("unit_gradients", _unit_gradients(fixed.detach(), mask, eroded))
@@ -104,8 +90,8 @@ class GradientCorrelation(nn.Module):
 
     def forward(self, moving: Tensor) -> Tensor:
         """GC of each view, shape (..., V), of rendered images (..., V, rows, cols)."""
-        _check_images(moving, self.unit_gradients[:, 0])
-        return _in_blocks(lambda b: _correlate(b, self.unit_gradients, self.mask, self.eroded_mask), moving)
+        check_images(moving, self.unit_gradients[:, 0])
+        return in_blocks(lambda b: _correlate(b, self.unit_gradients, self.mask, self.eroded_mask), moving)
 
     def residuals(self, moving: Tensor) -> Tensor:
         """Differences of the unit gradients of `moving` and of the fixed images, for least-squares methods.
@@ -120,7 +106,7 @@ class GradientCorrelation(nn.Module):
         Returns:
             Tensor of shape (..., V, 2, rows, cols).
         """
-        _check_images(moving, self.unit_gradients[:, 0])
+        check_images(moving, self.unit_gradients[:, 0])
         fixed_says = (self.unit_gradients != 0).any(-1).any(-1)[..., None, None]
 
         def difference(block: Tensor) -> Tensor:
@@ -129,7 +115,7 @@ class GradientCorrelation(nn.Module):
             target = torch.where(flat, math.sqrt(2.0), 1.0).to(self.unit_gradients.dtype) * self.unit_gradients
             return unit * fixed_says - target
 
-        return _in_blocks(difference, moving)
+        return in_blocks(difference, moving)
 
 
 class GradientCorrelationLoss(nn.Module):
@@ -166,7 +152,29 @@ def _unit_gradients(images: Tensor, mask: Tensor | None, eroded: Tensor | None) 
     return unit_contrast(sobel_gradient(images), None if eroded is None else eroded[..., None, :, :], scale)
 
 
-def _in_blocks(function: Callable[[Tensor], Tensor], moving: Tensor, *, whole: bool = False) -> Tensor:
+def weights_of_pixels(
+    fixed: Tensor, mask: Tensor | None, weights: Tensor | None
+) -> tuple[Tensor | None, Tensor | None]:
+    """The mask as booleans, and how much each pixel's derivatives count, checked against the fixed images."""
+    if fixed.ndim != 3:
+        raise ValueError(f"fixed must have shape (V, rows, cols), got {tuple(fixed.shape)}")
+    if mask is not None:
+        _check_mask(mask, fixed)
+        mask = mask.detach() != 0
+    counted = torch.isfinite(fixed) if mask is None else torch.isfinite(fixed) | ~mask
+    if not counted.all():
+        raise ValueError(f"fixed must be finite where it counts, got {int((~counted).sum())} pixels that are not")
+    eroded = None if mask is None else erode_mask(mask)
+    if weights is not None:
+        _check_mask(weights, fixed)
+        if not bool((weights >= 0).all()):
+            raise ValueError("weights must not be negative")
+        weights = weights.detach().to(fixed.dtype)
+        eroded = weights if eroded is None else eroded * weights
+    return mask, eroded
+
+
+def in_blocks(function: Callable[[Tensor], Tensor], moving: Tensor, *, whole: bool = False) -> Tensor:
     """`function` of (K, V, rows, cols) images, a few candidates at a time, with the leading axes put back."""
     if whole or moving.device.type != "cpu" or moving.numel() <= _PIXELS_PER_BLOCK:
         return function(moving)
@@ -176,7 +184,8 @@ def _in_blocks(function: Callable[[Tensor], Tensor], moving: Tensor, *, whole: b
     return result.reshape(*moving.shape[:-3], *result.shape[1:])
 
 
-def _check_images(moving: Tensor, fixed: Tensor) -> None:
+def check_images(moving: Tensor, fixed: Tensor) -> None:
+    """Raises ValueError unless images agree in (V, rows, cols)."""
     if fixed.ndim < 3 or moving.ndim < 3 or moving.shape[-3:] != fixed.shape[-3:]:
         raise ValueError(
             f"moving and fixed must agree in (V, rows, cols), got {tuple(moving.shape)} and {tuple(fixed.shape)}"

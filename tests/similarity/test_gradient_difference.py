@@ -1,0 +1,55 @@
+"""Gradient difference: what it sees beyond gradient correlation, and what it shares with it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchkcreg.similarity import GradientCorrelation, GradientDifference
+
+
+def images(*shape: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+
+def test_an_offset_means_nothing_and_a_factor_costs_its_square():
+    fixed = images(2, 20, 18)
+    gd = GradientDifference(fixed)
+    torch.testing.assert_close(gd(fixed + 3.0), torch.ones(2).double())
+    torch.testing.assert_close(gd(0.8 * fixed), torch.full((2,), 1 - 0.5 * 0.2**2).double())
+
+
+def test_near_a_match_of_equal_contrast_it_is_gradient_correlation():
+    fixed = images(3, 24, 24)
+    noise = 1e-3 * images(3, 24, 24)
+    moving = fixed + noise
+    scale = (GradientCorrelation(fixed)(moving) - GradientDifference(fixed)(moving)).abs()
+    assert float(scale.max()) < 1e-6
+
+
+def test_squared_residuals_sum_to_the_loss_with_mask_and_weights():
+    fixed, moving, weights = images(2, 16, 16), images(4, 2, 16, 16).flip(0), images(2, 16, 16)
+    mask = torch.ones(2, 16, 16, dtype=torch.bool)
+    mask[:, 3:6, 7:9] = False
+    gd = GradientDifference(fixed, mask, weights)
+    broken = torch.where(mask, moving, torch.nan)
+    torch.testing.assert_close(gd(broken), 1 - gd.residuals(broken).square().sum((-3, -2, -1)) / 4)
+
+
+def test_a_flat_measured_view_says_nothing():
+    fixed = images(2, 16, 16)
+    fixed[1] = 0.7
+    gd = GradientDifference(fixed)
+    assert gd(images(2, 16, 16).flip(-1))[1] == 1.0
+    assert torch.isfinite(gd.residuals(fixed)).all()
+
+
+def test_gradients_agree_with_differences():
+    gd = GradientDifference(images(1, 8, 8))
+    moving = images(2, 1, 8, 8).flip(-1).requires_grad_(True)
+    assert torch.autograd.gradcheck(gd, (moving,))
+
+
+def test_weights_below_zero_are_refused():
+    with pytest.raises(ValueError, match="negative"):
+        GradientDifference(images(1, 8, 8), weights=-images(1, 8, 8))
