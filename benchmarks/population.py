@@ -16,6 +16,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,12 @@ from tqdm import tqdm  # noqa: E402
 from torchkcreg.evaluation import bb_rmse  # noqa: E402
 from torchkcreg.experiments.capture import registration_inputs  # noqa: E402
 from torchkcreg.implant import find_holes  # noqa: E402
-from torchkcreg.registration import Callback, RegistrationConfig, Trainer, build_scene  # noqa: E402
-from torchkcreg.registration.result import RegistrationResult  # noqa: E402
+from torchkcreg.physics import line_integrals_from_intensity  # noqa: E402
+from torchkcreg.registration import Callback, RegistrationConfig, RegistrationData, Trainer, build_scene  # noqa: E402
 from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case  # noqa: E402
 
 WRONG_MM, RIGHT_MM = 0.15, 0.10
+Job = tuple[int, str, bool, dict[str, Any], str, str]
 
 
 class _ErrorsOfStages(Callback):
@@ -56,10 +58,25 @@ class _ErrorsOfStages(Callback):
         self.errors.append(f"{error:.3f}/{trainer.history[-1]['loss']:.4f}")
 
 
-def register_case(case: SimulatedCase, draw: Draw, known: bool, options: dict[str, Any]) -> dict[str, Any]:
+def unrelated_images(case: SimulatedCase, draw: Draw, data: RegistrationData, images: str) -> dict[str, Any]:
+    """Line integrals and geometry of images that do not show the case's implant where the geometry has it."""
+    if images == "mirrored":
+        return {"line_integrals": data.line_integrals.flip(-1), "mask": data.mask.flip(-1)}
+    if images == "turned":
+        return {"line_integrals": data.line_integrals.flip(-2, -1), "mask": data.mask.flip(-2, -1)}
+    other = random_case(draw_case(draw.seed + 1000))
+    lines, mask = line_integrals_from_intensity(other.intensity.float(), other.open_beam)
+    return {"line_integrals": lines, "mask": mask, "geometry": other.geometry}
+
+
+def register_case(
+    case: SimulatedCase, draw: Draw, known: bool, options: dict[str, Any], images: str = "own"
+) -> dict[str, Any]:
     """The row of one case: errors in mm and what the registration says of itself."""
     config = RegistrationConfig(material=case.implant_material, **options)
     data, cloud, screws = registration_inputs(case, config.pitch_mm)
+    if images != "own":
+        data = replace(data, **unrelated_images(case, draw, data, images))
     nodes = cloud.coarsened(8).points.double()
     truth = case.deform(nodes)
     start = time.perf_counter()
@@ -85,7 +102,9 @@ def register_case(case: SimulatedCase, draw: Draw, known: bool, options: dict[st
         "worst": round(max(beads, node, largest), 4),
         "depth": round(float(depth.square().mean().sqrt()), 4),
         "gc": round(float(result.gc.mean()), 4),
-        "status": _status(result),
+        **{name: value for name, value in result.diagnostics.items() if name != "gc"},
+        "gc_views": result.diagnostics["gc"],
+        "status": result.status,
         "warnings": "; ".join(result.warnings),
         "seconds": round(time.perf_counter() - start, 1),
         "azimuth": draw.azimuth_deg,
@@ -96,12 +115,8 @@ def register_case(case: SimulatedCase, draw: Draw, known: bool, options: dict[st
     }
 
 
-def _status(result: RegistrationResult) -> str:
-    return getattr(result, "status", "ok")
-
-
-def _job(job: tuple[int, str, bool, dict[str, Any], str]) -> dict[str, Any]:
-    seed, views, known, options, cache = job
+def _job(job: Job) -> dict[str, Any]:
+    seed, views, known, options, images, cache = job
     torch.set_num_threads(1)
     draw = draw_case(seed)
     kept = Path(cache) / f"{views}-{seed}.npy" if cache else None
@@ -110,7 +125,8 @@ def _job(job: tuple[int, str, bool, dict[str, Any], str]) -> dict[str, Any]:
         kept.parent.mkdir(parents=True, exist_ok=True)
         np.save(kept, case.intensity.numpy())
     try:
-        return register_case(case, draw, known, options)
+        row = register_case(case, draw, known, options, images)
+        return row if images == "own" else {**row, "worst": float("inf")}
     except (ValueError, RuntimeError) as error:
         return {"seed": seed, "status": "failed", "warnings": f"{type(error).__name__}: {error}", "worst": float("inf")}
 
@@ -119,7 +135,7 @@ def _load(path: Path | None) -> torch.Tensor | None:
     return torch.from_numpy(np.load(path)) if path is not None and path.exists() else None
 
 
-def rows_of(path: Path, jobs: list[tuple[int, str, bool, dict[str, Any], str]]) -> Iterator[dict[str, Any]]:
+def rows_of(path: Path, jobs: list[Job]) -> Iterator[dict[str, Any]]:
     """Rows of all jobs, those that the table has already first; new ones are appended to it."""
     done = _read(path)
     yield from done.values()
@@ -180,20 +196,25 @@ def main() -> None:
     parser.add_argument("--seeds", type=lambda text: [int(s) for s in text.split(",")], help="these seeds alone")
     parser.add_argument("--views", choices=("neighbours", "around", "both"), default="neighbours")
     parser.add_argument("--known", action="store_true", help="screws and spectrum are told")
+    parser.add_argument(
+        "--images", choices=("own", "other", "mirrored", "turned"), default="own", help="else: wrong ones"
+    )
     parser.add_argument("--options", type=json.loads, default={}, help="options of the registration as JSON")
     parser.add_argument("--cache", default="", help="folder that keeps the images")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     name = f"population-{options.views}-{'known' if options.known else 'plain'}"
+    name += "" if options.images == "own" else f"-{options.images}"
     seeds = options.seeds or range(options.first, options.first + options.cases)
-    jobs = [(seed, options.views, options.known, options.options, options.cache) for seed in seeds]
+    jobs = [(seed, options.views, options.known, options.options, options.images, options.cache) for seed in seeds]
     rows = sorted(rows_of(options.out / f"{name}.jsonl", jobs), key=lambda row: row["seed"])
     with (options.out / f"{name}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, max(rows, key=len), extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
-    draw_plot(rows, options.out / f"{name}.png")
+    if options.images == "own":
+        draw_plot(rows, options.out / f"{name}.png")
     print(summary(rows))
 
 

@@ -63,7 +63,8 @@ def test_a_registration_leaves_a_whole_run_folder(finished):
     metrics = json.loads((finished / "metrics.json").read_text())
     assert len(metrics["gc"]) == 3
     assert min(metrics["gc"]) > 0.8
-    assert metrics["warnings"] == []
+    assert metrics["status"] == ("doubtful" if metrics["warnings"] else "ok")
+    assert metrics["node_std_mm"] < 0.5
 
 
 def test_a_registration_finds_most_of_the_motion(small_case, finished, tmp_path):
@@ -183,7 +184,8 @@ def test_bad_pixels_are_masked_counted_and_said_in_one_line(small_case, tmp_path
     out = tmp_path / "run"
     arguments = command(small_case, out, projections=tmp_path / "bad.npz", views="0,2")
     assert main([*arguments, "--no-figures"]) == 0
-    (warning,) = capsys.readouterr().err.splitlines()
+    warning, *of_verdict = capsys.readouterr().err.splitlines()
+    assert not any("masked" in line for line in of_verdict)
     said = "3 pixels are masked (3 not finite)"
     assert warning.startswith("torchkcreg register: warning: ")
     assert said in warning
@@ -388,3 +390,26 @@ def test_evaluate_says_what_is_missing_or_wrong(small_case, finished, true_shape
     filled = [flag.format(case=small_case, shape=true_shape) for flag in flags]
     assert main(["evaluate", f"--run={finished}", *filled]) == 2
     assert message in the_error(capsys, "evaluate")
+
+
+def test_a_failed_registration_is_exit_status_3_and_is_written(small_case, tmp_path, capsys):
+    with np.load(small_case / "projections.npz") as file:
+        intensity, open_beam = file["intensity"], file["open_beam"]
+    np.savez(tmp_path / "wrong.npz", intensity=intensity[:, ::-1, ::-1], open_beam=open_beam)
+    out = tmp_path / "run"
+    assert main([*command(small_case, out, projections=tmp_path / "wrong.npz"), "--no-figures"]) == 3
+    output = capsys.readouterr()
+    assert output.out.startswith("failed: ")
+    assert "torchkcreg register: warning: " in output.err
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["status"] == "failed"
+    assert metrics["warnings"]
+    assert read_run_quietly(out).status == "failed"
+    arguments = ["warp", f"--run={out}", f"--points={small_case / 'before.csv'}", f"--out={tmp_path / 'w.csv'}"]
+    assert main(arguments) == 0
+    assert "is failed: " in capsys.readouterr().err
+
+
+def read_run_quietly(folder):
+    with pytest.warns(UserWarning, match="is failed"):
+        return read_run(folder)

@@ -17,8 +17,15 @@ import torchkcreg
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
+_FAILED = 3  # exit status
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns its exit status: 0, or 2 after a one-line error that names what was wrong."""
+    """Runs one command; returns its exit status.
+
+    0, or 2 after a one-line error that names what was wrong, or 3 after a registration whose result, which is written,
+    is not to be trusted.
+    """
     try:
         options = _parser().parse_args(arguments)
     except SystemExit as done:  # argparse is done after --help, --version, or a wrong flag
@@ -33,14 +40,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show
-            options.run(options)
+            status = options.run(options)
     except (ValueError, OSError) as error:
         print(f"{name}: error: {_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130
-    return 0
+    return status or 0
 
 
 def _one_line(message: Exception | str) -> str:
@@ -104,7 +111,7 @@ def _integers(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(f"views must be integers separated by commas, got {text!r}") from None
 
 
-def _register(options: argparse.Namespace) -> None:
+def _register(options: argparse.Namespace) -> int:
     from torchkcreg.experiments import RegistrationFiles, register_files, register_seeds
 
     if options.seeds is not None and options.resume:
@@ -120,7 +127,8 @@ def _register(options: argparse.Namespace) -> None:
     else:
         result = register_files(files, options.out, resume=options.resume, **how)
     similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())
-    print(f"gradient correlation of each view {similarity}; run folder {options.out}")
+    print(f"{result.status}: gradient correlation of each view {similarity}; run folder {options.out}")
+    return _FAILED if result.status == "failed" else 0
 
 
 def _add_warp(commands) -> None:

@@ -6,11 +6,15 @@ import pytest
 import torch
 from small_scene import bend, image, pose, scene
 
+from torchkcreg.deformation import cluster_control_points, control_point_masses, default_grid, group_centers
 from torchkcreg.geometry import transform_points
+from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import RegistrationConfig, Scene, Stage
-from torchkcreg.registration.elasticity import ModalMotion
+from torchkcreg.registration.elasticity import Elasticity, ModalMotion
 from torchkcreg.registration.model import StageModel
+from torchkcreg.registration.motion import GroupMotion
 from torchkcreg.registration.objective import StageObjective
+from torchkcreg.simulation import locking_plate
 
 GRID = {"grid_shape": (4, 4, 8), "grid_spacing_mm": (8.0, 8.0, 8.0)}
 CONFIG = RegistrationConfig(stages=(Stage(groups=8, modes=14, oversampling=1),), **GRID)
@@ -66,6 +70,28 @@ def test_a_stage_of_modes_starts_from_the_bend_so_far() -> None:
     error = (in_world(here) - before).norm(dim=-1)
     assert float(bending.norm(dim=-1).max()) > 0.1
     assert float(error.max()) < 0.02 * float(bending.norm(dim=-1).max())
+
+
+@pytest.mark.parametrize(("holes", "width"), [(4, 11.0), (6, 8.0), (7, 13.5), (9, 13.8)])
+def test_modes_of_short_and_narrow_plates_follow_a_bend(holes: int, width: float) -> None:
+    mesh = locking_plate(length=15.0 * holes, width=width, thickness=3.2, num_holes=holes)
+    cloud = ImplantPointCloud.from_mesh(mesh, 1.0)
+    grid = default_grid(cloud.points)
+    masses = control_point_masses(grid, cloud.points, cloud.masses)
+    labels = cluster_control_points(grid, masses, 20)
+    rest = grid.positions().reshape(-1, 3)
+    carried, centers = masses.flatten(), group_centers(grid, labels)
+    groups = GroupMotion(rest, torch.zeros_like(rest), labels.flatten(), carried, centers)
+    elasticity = Elasticity(grid, labels, cloud.points, cloud.masses)
+    _, depth, height = cloud.points.double().unbind(-1)
+    curvature = 2.0 / height.max() ** 2
+    displacement = torch.stack([0 * height, curvature / 2 * height**2, -curvature * height * depth], dim=-1)
+    motion = ModalMotion(groups, elasticity, 40, displacement @ grid.frame[:3, :3])
+    assert motion.misfit_mm < 0.02
+    assert float(motion.start.abs().max()) < 5.0
+    motions = motion.steps(torch.zeros(1, motion.num_parameters).double())
+    middles = elasticity.of_filling().displacements(motions)  # groups without metal go along, they do not fly away
+    assert float(middles.norm()) < 5.0
 
 
 def in_world(of: Scene) -> torch.Tensor:

@@ -107,10 +107,13 @@ def _run(path: Path) -> str:
     metrics = read_json(path / "metrics.json", "metrics") if (path / "metrics.json").is_file() else {}
     shape = " x ".join(str(n) for n in result.deformation.grid.shape)
     groups = int(result.deformation.labels.max()) + 1
+    size = f"{shape} control points in {groups} group{'s' * (groups > 1)}"
     lines = [
-        f"run, {shape} control points in {groups} group{'s' * (groups > 1)}, {len(result.history)} iterations",
+        f"run, {result.status}, {size}, {len(result.history)} iterations",
         "  gradient correlation of each view: " + " ".join(f"{gc:.3f}" for gc in result.gc.tolist()),
     ]
+    if isinstance(metrics.get("node_std_mm"), float):
+        lines.append(f"  expected error of the nodes: {metrics['node_std_mm']:.3f} mm (RMS)")
     if {"mean_motion_mm", "largest_motion_mm"} <= metrics.keys():
         lines.append(
             f"  motion of the nodes: mean {metrics['mean_motion_mm']:.3f} mm, largest "

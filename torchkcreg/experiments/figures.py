@@ -91,9 +91,9 @@ def _drr(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Te
 @torch.no_grad()
 def _similarity(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Tensor:
     """GC (V,) as the result has it, so that start and result are measured alike."""
-    stage = result.config.schedule()[-1].model_copy(update={"robust": False})
+    stage = result.config.schedule()[-1].model_copy(update={"robust": False, "contrast": False})
     objective = stage_objective(scene, data, stage, result.config)
-    return objective.gradient_correlations(objective.model.at_rest)[0]
+    return objective.similarities(objective.model.at_rest)[0]
 
 
 def _labels(geometry: ConeBeamGeometry, views: list[int]) -> list[str]:

@@ -60,7 +60,8 @@ def register_files(
     """The result of a registration whose run folder is written to ``out``.
 
     All inputs are read and checked before anything is written. What a user should know before trusting the numbers is
-    given as Python warnings and stands in the result.
+    given as Python warnings and stands in the result, with a status: a failed registration is written too, for looking
+    at.
 
     Args:
         files: What is registered to what.
@@ -175,11 +176,14 @@ def _metrics(result: RegistrationResult, scene: Scene, initial: Tensor, seconds:
     points = scene.implant.points.double()
     motion = (result.warp(points) - transform_points(initial, points)).norm(dim=-1)
     return {
+        "status": result.status,
         "gc": result.gc.tolist(),
+        "node_std_mm": result.diagnostics.get("node_std_mm"),
         "mean_motion_mm": float(motion.mean()),
         "largest_motion_mm": float(motion.max()),
         "intensity": result.intensity,
         "screws_found": result.screws,
+        "diagnostics": {name: v for name, v in result.diagnostics.items() if name not in ("gc", "node_std_mm")},
         "seconds": seconds,
         "warnings": result.warnings,
     }

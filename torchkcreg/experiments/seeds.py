@@ -138,5 +138,7 @@ def _warn(runs: SeedRuns, known: int) -> None:
             f"{len(runs.seeds)} seeds end up to {runs.spread_mm:.3f} mm from their mean (RMS over nodes), more than "
             f"{LARGEST_SPREAD_MM:g} mm: the views do not settle the result"
         )
+        if runs.result.status == "ok":
+            runs.result.status = "doubtful"
     for message in runs.result.warnings[known:]:
         warnings.warn(message, stacklevel=3)

@@ -21,7 +21,7 @@ def result_to_dict(result: RegistrationResult) -> dict[str, Any]:
     Keys: `format`, `format_version`, `units`, `implant_to_world` (4x4), `grid` (`shape`, `spacing_mm`,
     `grid_to_implant` 4x4), `control_points_mm` (nx, ny, nz, 3: displacements along the grid's axes), `labels` (nx, ny,
     nz: group of each control point), `components` (name: 4x4 motion in the implant's frame), `intensity`, `gc` (one a
-    view), `seed`, `warnings`, `config`. The history is not in it.
+    view), `seed`, `status`, `warnings`, `diagnostics`, `config`. The history is not in it.
 
     Raises:
         ValueError: a parameter is not finite.
@@ -49,7 +49,9 @@ def result_to_dict(result: RegistrationResult) -> dict[str, Any]:
             "intensity": result.intensity,
             "gc": result.gc,
             "seed": result.seed,
+            "status": result.status,
             "warnings": result.warnings,
+            "diagnostics": result.diagnostics,
             "config": result.config.model_dump(mode="json"),
         }
     )
@@ -82,6 +84,8 @@ def result_from_dict(content: Any, *, history: list[dict[str, Any]] | None = Non
         history=list(history or []),
         config=RegistrationConfig.model_validate(content["config"]),
         seed=int(content.get("seed", 0)),
+        status=content.get("status", "ok"),
+        diagnostics=dict(content.get("diagnostics", {})),
         warnings=[str(text) for text in content.get("warnings", [])],
         components={
             name: finite_array(motion, (4, 4), f"motion of component {name}")

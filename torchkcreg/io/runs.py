@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -193,6 +194,8 @@ class RunFolder:
 def read_run(path: str | os.PathLike[str]) -> RegistrationResult:
     """The result of a finished registration, in float64: it warps points as the result that was written did.
 
+    One that is not to be trusted is read too, with a warning that says why.
+
     Args:
         path: the run folder.
 
@@ -202,7 +205,11 @@ def read_run(path: str | os.PathLike[str]) -> RegistrationResult:
     """
     if not Path(path).is_dir():
         raise FileNotFoundError(f"run folder {path} does not exist")
-    return RunFolder(path).read_result()
+    result = RunFolder(path).read_result()
+    if result.status != "ok":
+        reasons = "; ".join(result.warnings)
+        warnings.warn(f"the registration in {path} is {result.status}: {reasons}", stacklevel=2)
+    return result
 
 
 def _require_loadable(content: Any, where: str) -> None:

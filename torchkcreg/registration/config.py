@@ -19,7 +19,7 @@ class Stage(BaseModel):
             spans fewer control points has as many groups as it can.
         modes: The groups move along this many of the implant's softest elastic modes, rigid ones included; None: each
             group has its own six degrees of freedom.
-        bin: Detector pixels are averaged in squares of this side.
+        bin: Detector pixels are averaged in squares of this side, of at most 6.5 mm.
         oversampling: DRRs are rendered on pixels this many times finer and averaged as intensities: the mean of
             exponentials is not the exponential of the mean, and depth hangs on the difference.
         pitch_factor: The implant's nodes are merged on a lattice this many times coarser.

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from torchkcreg.deformation import ControlPointGrid, group_moment_gradients, group_moments, strain_energy
-from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.geometry import transform_points
 
 from .motion import GroupMotion
 
 _DIFFERENCE_MM = 1e-3
 _FIT_ITERATIONS = 5
+# The control points are joined by a matter much softer than metal, and lighter still. It tells groups that hold no
+# metal to follow those that do, and its own vibrations are far from the implant's softest.
+_FILLING_STIFFNESS = 1e-6
+_FILLING_DENSITY = 1e-9
 
 
 class Elasticity:
@@ -24,17 +26,25 @@ class Elasticity:
     Args:
         grid: Control points.
         labels: Group of each control point.
-        cloud: Nodes of the implant; bending is smooth, a few thousand give its integral.
+        points: Nodes of the implant, shape (N, 3); bending is smooth, a few thousand give its integral.
+        masses: Their volumes, shape (N,), mm^3.
     """
 
-    def __init__(self, grid: ControlPointGrid, labels: Tensor, cloud: ImplantPointCloud) -> None:
-        points = cloud.points.double()
+    def __init__(self, grid: ControlPointGrid, labels: Tensor, points: Tensor, masses: Tensor) -> None:
+        points = points.double()
         shares, moments = group_moments(grid, labels, points)
-        self.volumes = cloud.masses.double()
+        self.volumes = masses.double()
         self.moments = torch.cat([shares[..., None], moments], dim=-1).flatten(1)
         self.slopes = group_moment_gradients(grid, labels, points).flatten(-2)
-        self.points = cloud.points
+        self.grid, self.labels, self.points = grid, labels, points
         self.share = (self.volumes / self.volumes.sum()).sqrt()
+
+    def of_filling(self) -> Elasticity:
+        """The same for a solid that fills the grid's valid domain, one node a cell."""
+        cells = self.grid.positions()[1:-2, 1:-2, 1:-2].reshape(-1, 3)
+        spacing = torch.tensor(self.grid.spacing, dtype=torch.float64)
+        middles = transform_points(self.grid.frame, cells + spacing / 2)
+        return Elasticity(self.grid, self.labels, middles, spacing.prod().expand(len(middles)))
 
     @property
     def volume(self) -> float:
@@ -64,10 +74,11 @@ class ModalMotion:
     """Motions of groups along an implant's softest elastic modes.
 
     Modes solve ``K p = k M p`` with K the second derivatives of the elastic energy over the groups' parameters and M
-    those of the mean square displacement. The first six are rigid (k = 0), then come the implant's bends and twists
-    in the order of their stiffness, whatever its shape. What an implant would resist is thus left out, and what is
-    left is smooth where splitting into ever more rigid groups leaves kinks. Parameters are increments to what the modes
-    can follow of the displacement so far.
+    those of the mean square displacement, both with a trace of a soft matter between the control points: groups that
+    hold hardly any metal would leave the pencil without a definite solution. The first six are rigid (k = 0), then come
+    the implant's bends and twists in the order of their stiffness, whatever its shape. What an implant would resist is
+    thus left out, and what is left is smooth where splitting into ever more rigid groups leaves kinks. Parameters are
+    increments to what the modes can follow of the displacement so far.
 
     Args:
         groups: The groups' motions from the undeformed implant.
@@ -80,20 +91,28 @@ class ModalMotion:
         modes: (P, m): groups' parameters of a mode whose root mean square displacement is 1 mm.
         stiffnesses: (m,): second derivative of the energy (the integral of its density over Young's modulus) along
             each mode, mm.
+        misfit_mm: Root mean square of what the modes cannot follow of the displacement so far.
     """
 
     def __init__(self, groups: GroupMotion, elasticity: Elasticity, num_modes: int, displacement: Tensor) -> None:
         self.groups = groups
-        size = groups.num_parameters
-        strains = _derivatives(lambda p: elasticity.strains(groups.steps(p)), size)
-        moves = _derivatives(lambda p: elasticity.displacements(groups.steps(p)), size)
-        values, self.modes = _generalized_eigenvectors(strains @ strains.T, moves @ moves.T, min(num_modes, size))
+        moves, inertia, stiffness = _derivatives(groups, elasticity)
+        filling = elasticity.of_filling()
+        _, light, soft = _derivatives(groups, filling)
+        share = filling.volume / elasticity.volume
+        inertia, stiffness = inertia + _FILLING_DENSITY * share * light, stiffness + _FILLING_STIFFNESS * share * soft
+        number = min(num_modes, groups.num_parameters)
+        values, self.modes = _generalized_eigenvectors(stiffness, inertia, number)
         self.stiffnesses = elasticity.volume * values.clamp_min(0.0)
         self.start = torch.zeros(self.modes.shape[1], dtype=torch.float64)
         wanted = (displacement.double() * elasticity.share[:, None]).flatten()
+        along = self.modes.T @ moves
+        fits = []
         for _ in range(_FIT_ITERATIONS):  # Gauss-Newton: finite rotations are not quite linear
             missing = wanted - elasticity.displacements(self.steps(torch.zeros_like(self.start)[None]))[0]
-            self.start = self.start + self.modes.T @ (moves @ missing)
+            fits.append((float(missing.detach().norm()), self.start))
+            self.start = self.start + torch.linalg.solve(along @ along.T, along @ missing)
+        self.misfit_mm, self.start = min(fits, key=lambda fit: fit[0])
 
     @property
     def num_parameters(self) -> int:
@@ -120,16 +139,18 @@ class ModalMotion:
         return (self.start + parameters) @ self.modes.T
 
 
-def _derivatives(function: Callable[[Tensor], Tensor], size: int) -> Tensor:
-    """Derivatives (P, S) of a function of P parameters at zero."""
-    offsets = _DIFFERENCE_MM * torch.eye(size, dtype=torch.float64)
-    return (function(offsets) - function(-offsets)) / (2 * _DIFFERENCE_MM)
+def _derivatives(groups: GroupMotion, elasticity: Elasticity) -> tuple[Tensor, Tensor, Tensor]:
+    """At rest: those (P, S) of the displacements, and the second ones (P, P) of their mean square and of the energy."""
+    offsets = _DIFFERENCE_MM * torch.eye(groups.num_parameters, dtype=torch.float64)
+    ahead, behind = groups.steps(offsets), groups.steps(-offsets)
+    moves = (elasticity.displacements(ahead) - elasticity.displacements(behind)) / (2 * _DIFFERENCE_MM)
+    strains = (elasticity.strains(ahead) - elasticity.strains(behind)) / (2 * _DIFFERENCE_MM)
+    return moves, moves @ moves.T, strains @ strains.T
 
 
 def _generalized_eigenvectors(stiffness: Tensor, inertia: Tensor, number: int) -> tuple[Tensor, Tensor]:
     """The smallest eigenvalues (m,) and vectors (P, m), of inertia one, of a symmetric pencil."""
-    tiny = 1e-8 * inertia.diagonal().mean()  # groups that carry hardly any of the implant
-    lower = torch.linalg.cholesky(inertia + tiny * torch.eye(len(inertia)).to(inertia))
+    lower = torch.linalg.cholesky(inertia)
     half = torch.linalg.solve_triangular(lower, stiffness, upper=False)
     reduced = torch.linalg.solve_triangular(lower, half.T, upper=False)
     values, vectors = torch.linalg.eigh(0.5 * (reduced + reduced.T))

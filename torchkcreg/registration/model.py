@@ -21,6 +21,7 @@ from .nuisance import Nuisance
 from .scene import Scene
 
 _SCREW_PITCH_MM = 0.5
+_COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
 _SOLID_PITCH_FACTOR = 8  # bending is smooth: its energy needs few nodes
 
 
@@ -73,7 +74,7 @@ class StageModel:
         self._prepare_motion()
         self._prepare_clouds()
         self._prepare_images(data)
-        self.nuisance = Nuisance(scene, config, stage.estimate, stage.bin / stage.oversampling)
+        self.nuisance = Nuisance(scene, config, stage.estimate, self.bin / stage.oversampling)
         if scene.found and stage.screws == "fit":
             self.screws = ScrewShapes(scene.found, self.screw_path)
         shapes = self.screws.num_parameters if self.screws else 0
@@ -93,7 +94,7 @@ class StageModel:
             group_centers(grid, self.labels),
         )
         solid = self.implant.coarsened(max(1, _SOLID_PITCH_FACTOR // self.stage.pitch_factor))
-        self.elasticity = Elasticity(grid, self.labels, solid)
+        self.elasticity = Elasticity(grid, self.labels, solid.points, solid.masses)
         self.motion: GroupMotion | ModalMotion = groups
         if self.stage.modes is not None:
             moved = self.scene.deformation.displacement(solid.points.double()) @ grid.frame[:3, :3].double()
@@ -120,7 +121,8 @@ class StageModel:
     def _prepare_images(self, data: RegistrationData) -> None:
         stage = self.stage
         at_start = self.world_points(torch.zeros(1, self.motion.num_parameters, dtype=torch.float64))
-        self.data = data.binned(stage.bin)
+        self.bin = min(stage.bin, max(1, int(_COARSEST_PIXEL_MM / data.geometry.pixel_spacing[1])))
+        self.data = data.binned(self.bin)
         if stage.margin_mm is not None:
             margin_px = stage.margin_mm / self.data.geometry.pixel_spacing[1]
             self.data = self.data.windowed(torch.cat([points[0] for points in at_start]), margin_px)

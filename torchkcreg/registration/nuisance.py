@@ -64,6 +64,12 @@ class Nuisance:
         """Steps (K, D) within the bounds."""
         return torch.minimum(torch.maximum(steps, self.low), self.high)
 
+    def at_bounds(self, share: float) -> list[str]:
+        """Names of the parameters that are within a share of their range of a bound that is not their start's."""
+        margin = share * (self.high - self.low)
+        near = (self.low > -margin) | (self.high < margin)
+        return [name for name, is_near in zip(self.names, near.tolist(), strict=True) if is_near]
+
     def values(self, steps: Tensor) -> Tensor:
         """Values (K, D) of the parameters after steps."""
         return self.start + self.scale * steps

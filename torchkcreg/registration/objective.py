@@ -70,17 +70,17 @@ class StageObjective:
         """Candidates with the parameters of intensity model and screws inside their bounds."""
         return self.model.clamped(parameters)
 
-    def gradient_correlations(self, parameters: Tensor) -> Tensor:
-        """GC (K, V) of each candidate and view."""
+    def similarities(self, parameters: Tensor) -> Tensor:
+        """GD or GC (K, V) of each candidate and view."""
         return self.similarity(self.model.line_integrals(parameters))
 
     @torch.no_grad()
     def losses(self, candidates: Tensor) -> Tensor:
-        """1 - GC and the penalties of candidates (K, D), shape (K,)."""
+        """One less the similarity, and the penalties, of candidates (K, D), shape (K,)."""
         return torch.cat([self._losses(c) for c in candidates.split(self._batch())])
 
     def _losses(self, candidates: Tensor) -> Tensor:
-        return 1 - self.gradient_correlations(candidates).double().mean(dim=-1) + self.penalty(candidates)
+        return 1 - self.similarities(candidates).double().mean(dim=-1) + self.penalty(candidates)
 
     def loss_and_gradient(self, parameters: Tensor) -> tuple[float, Tensor]:
         """Loss and gradient (D,) at one vector."""
@@ -91,16 +91,24 @@ class StageObjective:
 
     def curvature(self, parameters: Tensor, step_mm: float = 0.01) -> Tensor:
         """Gauss-Newton second derivatives (D, D): residual images differ by forward differences, R exactly."""
-        offsets = step_mm * torch.eye(self.num_parameters, dtype=torch.float64)
-        with torch.no_grad():
-            center = self._residuals(parameters[None])
-            jacobian = torch.cat([(self._residuals(parameters + o) - center) for o in offsets.split(self._batch())])
-        data = 0.5 / self.model.data.num_views / step_mm**2 * (jacobian @ jacobian.T).double()
+        return self.curvature_from(self.jacobian(parameters, step_mm)[0], parameters)
+
+    def curvature_from(self, jacobian: Tensor, parameters: Tensor) -> Tensor:
+        """Second derivatives (D, D) where the derivatives of the residuals are known."""
+        flat = jacobian.flatten(1)
         penalty = torch.autograd.functional.hessian(lambda p: self.penalty(p[None])[0], parameters)
-        return data + penalty
+        return 0.5 / self.model.data.num_views * (flat @ flat.T).double() + penalty
+
+    @torch.no_grad()
+    def jacobian(self, parameters: Tensor, step_mm: float = 0.01) -> tuple[Tensor, Tensor]:
+        """Derivatives (D, V, 2, rows, cols) of the residual images, and those (V, 2, rows, cols)."""
+        offsets = step_mm * torch.eye(self.num_parameters, dtype=torch.float64)
+        center = self._residuals(parameters[None])
+        steps = [(self._residuals(parameters + o) - center) / step_mm for o in offsets.split(self._batch())]
+        return torch.cat(steps), center[0]
 
     def _residuals(self, candidates: Tensor) -> Tensor:
-        return self.similarity.residuals(self.model.line_integrals(candidates)).flatten(1)
+        return self.similarity.residuals(self.model.line_integrals(candidates))
 
     def _batch(self) -> int:
         return max(1, _NODES_AT_ONCE // self.model.num_nodes)

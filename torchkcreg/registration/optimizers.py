@@ -73,7 +73,9 @@ def cmaes(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:
         report(Progress(strategy.countiter, float(strategy.best.f), spread))
         if spread < stage.tolerance:
             break
-    return problem.project(torch.as_tensor(strategy.mean, dtype=torch.float64)[None])[0]
+    ends = torch.as_tensor(np.stack([strategy.mean, strategy.best.x, np.zeros_like(strategy.mean)]))
+    ends = problem.project(ends)
+    return ends[int(problem.losses(ends).argmin())]
 
 
 def adam(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:

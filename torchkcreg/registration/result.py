@@ -12,6 +12,7 @@ from torchkcreg.deformation import FreeFormDeformation, spline_displacement
 from torchkcreg.geometry import transform_points
 
 from .config import RegistrationConfig
+from .verdict import Status
 
 
 @dataclass
@@ -25,7 +26,10 @@ class RegistrationResult:
         history: One record an iteration: stage, iteration, loss, step_mm, seconds.
         config: Options that made the result.
         seed: Seed of the random numbers.
+        status: "ok", "doubtful" or "failed": whether the result can be trusted, for the reasons in ``warnings``.
         warnings: What a user should know before trusting the numbers.
+        diagnostics: What the verdict rests on, see ``Diagnostics``; ``node_std_mm`` is the expected root mean square
+            error of the implant's nodes.
         components: Rigid motion (4, 4) of each component in the implant's frame.
         screws: Screws that were found: start, end and radius in the implant's frame before the motion, mm.
         intensity: Estimated parameters of the intensity model.
@@ -37,7 +41,9 @@ class RegistrationResult:
     history: list[dict[str, Any]]
     config: RegistrationConfig
     seed: int = 0
+    status: Status = "ok"
     warnings: list[str] = field(default_factory=list)
+    diagnostics: dict[str, Any] = field(default_factory=dict)
     components: dict[str, Tensor] = field(default_factory=dict)
     screws: list[dict[str, Any]] = field(default_factory=list)
     intensity: dict[str, float] = field(default_factory=dict)

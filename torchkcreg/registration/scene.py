@@ -97,6 +97,11 @@ class Scene(nn.Module):
         """Groups of control points that the deformation has been split into so far."""
         return int(self.deformation.labels.max()) + 1
 
+    def moving_state(self) -> dict[str, Tensor]:
+        """A copy of what a registration changes: pose, deformation, parameters of the intensity model."""
+        state = self.state_dict()
+        return {name: value.clone() for name, value in state.items() if not name.startswith("implant.")}
+
     @torch.no_grad()
     def component_motions(self) -> dict[str, Tensor]:
         """Rigid motion (4, 4) of each component in the implant's frame."""

@@ -16,12 +16,14 @@ from .callbacks import Callback
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
 from .found_screw import FoundScrew
+from .guard import Guard
 from .objective import StageObjective
 from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
 from .screws import find_screws
 from .slide import slid
+from .verdict import Diagnostics, diagnose, judge
 
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
@@ -60,6 +62,8 @@ class Trainer:
         self.stages = config.schedule()
         self.next_stage = 0
         self.history: list[dict[str, Any]] = []
+        self.undone: dict[str, str] = {}
+        self._guard: Guard | None = None
 
     def check(self) -> None:
         """Raises ValueError if the implant lies outside every view at its start pose."""
@@ -74,8 +78,11 @@ class Trainer:
 
     def _run_stage(self, index: int) -> None:
         stage, start = self.stages[index], time.perf_counter()
+        if self._guard is None:
+            self._guard = Guard(self.scene, with_scatter_shape(self.scene, self.data, self.config), self.config)
         for callback in self.callbacks:
             callback.on_stage_start(self, index, stage)
+        self._guard.before(stage)
         self._look_for_screws(stage)
         objective = stage_objective(self.scene, self.data, stage, self.config)
 
@@ -92,6 +99,8 @@ class Trainer:
             objective = stage_objective(self.scene, self.data, stage, self.config)
             found = minimize(objective, stage, seed=self.config.seed + index, report=report)
         objective.accept(found)
+        if (reason := self._guard.after()) is not None:
+            self.undone[str(index + 1)] = reason
         self.next_stage = index + 1
         for callback in self.callbacks:
             callback.on_stage_end(self, index, stage)
@@ -104,11 +113,14 @@ class Trainer:
 
     def _result(self) -> RegistrationResult:
         scene = self.scene
-        whole = self.stages[-1].model_copy(update={"robust": False})  # every pixel counts alike in what is reported
+        # What is reported is gradient correlation, in which every pixel counts alike.
+        whole = self.stages[-1].model_copy(update={"robust": False, "contrast": False})
         final = stage_objective(scene, self.data, whole, self.config)
         with torch.no_grad():
-            gc = final.gradient_correlations(final.model.at_rest)[0]
+            gc = final.similarities(final.model.at_rest)[0]
         intensity = {name: float(value.detach()) for name, value in scene.intensity.named_parameters()}
+        found = self._diagnostics(gc.tolist())
+        status, reasons = judge(found)
         return RegistrationResult(
             implant_to_world=scene.implant_to_world.clone(),
             deformation=scene.deformation,
@@ -116,19 +128,30 @@ class Trainer:
             history=self.history,
             config=self.config,
             seed=self.config.seed,
+            status=status,
+            warnings=reasons,
+            diagnostics=asdict(found),
             components=scene.component_motions(),
             intensity=intensity,
             screws=[asdict(screw) for screw in self.scene.found],
         )
 
+    def _diagnostics(self, gc: list[float]) -> Diagnostics:
+        last = self.stages[-1]
+        coarse = last.model_copy(update={"bin": max(last.bin, 2)})
+        objective = stage_objective(self.scene, self.data, coarse, self.config)
+        ended = self.history[-1] if self.history else {"iteration": 0, "step_mm": 0.0}
+        converged = ended["iteration"] < last.iterations or ended["step_mm"] < 10 * last.tolerance
+        return diagnose(self.scene, objective, gc, converged=converged, undone=self.undone)
+
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain types that :meth:`load_state_dict` continues from."""
-        scene = {name: value for name, value in self.scene.state_dict().items() if not name.startswith("implant.")}
         return {
-            "scene": scene,
+            "scene": self.scene.moving_state(),
             "next_stage": self.next_stage,
             "history": self.history,
             "screws": [asdict(screw) for screw in self.scene.found],
+            "undone": self.undone,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -145,3 +168,4 @@ class Trainer:
         if self.scene.holes:
             self.scene.place([FoundScrew(**screw) for screw in state["screws"]], self.config.pitch_mm)
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])
+        self.undone = dict(state["undone"])

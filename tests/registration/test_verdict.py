@@ -1,0 +1,87 @@
+"""What is said of a registration: right ones are ok, wrong ones are not, each for its own reason."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_scene import RIGID, SCREW, image, pose, scene
+
+from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, Trainer
+from torchkcreg.registration.nuisance import Nuisance
+from torchkcreg.registration.verdict import Diagnostics, judge
+
+CONFIG = RegistrationConfig(stages=RIGID)
+GOOD = Diagnostics(gc=[0.95, 0.9], misfit=0.01, node_std_mm=0.02, seen=[1.0, 0.8], strain=1e-4)
+BAD = {
+    "gc": ("failed", [0.9, 0.1]),
+    "seen": ("failed", [0.01, 0.0]),
+    "folds": ("failed", True),
+    "misfit": ("doubtful", 0.1),
+    "node_std_mm": ("doubtful", float("nan")),
+    "strain": ("doubtful", 0.01),
+    "converged": ("doubtful", False),
+    "at_bounds": ("doubtful", ["scatter"]),
+    "undone": ("doubtful", {"3": "it lost"}),
+}
+
+
+def test_a_good_registration_is_ok() -> None:
+    assert judge(GOOD) == ("ok", [])
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_each_flaw_alone_is_told(name: str) -> None:
+    expected, value = BAD[name]
+    status, reasons = judge(replace(GOOD, **{name: value}))
+    assert status == expected
+    assert len(reasons) == 1
+
+
+def test_a_view_that_hardly_shows_the_implant_is_named() -> None:
+    status, (reason,) = judge(replace(GOOD, seen=[1.0, 0.1]))
+    assert status == "doubtful"
+    assert "view 1" in reason
+
+
+def registered(data: RegistrationData, config: RegistrationConfig = CONFIG, **start):
+    return Trainer(scene(config, **start), data, config).fit()
+
+
+def test_the_right_images_are_ok() -> None:
+    result = registered(
+        image(scene(CONFIG, components=[SCREW]), CONFIG), components=[SCREW], implant_to_world=pose(1.0, 1.0)
+    )
+    assert result.status == "ok", result.warnings
+    assert result.warnings == []
+    assert result.diagnostics["node_std_mm"] < 0.1
+
+
+@pytest.mark.parametrize("what", ["blank", "flipped", "noise"])
+def test_images_of_something_else_fail(what: str) -> None:
+    data = image(scene(CONFIG), CONFIG)
+    lines = {
+        "blank": torch.zeros_like(data.line_integrals),
+        "flipped": data.line_integrals.flip(-1, -2),
+        "noise": torch.rand(data.line_integrals.shape, generator=torch.Generator().manual_seed(0)),
+    }[what]
+    result = registered(replace(data, line_integrals=lines))
+    assert result.status == "failed"
+    assert result.warnings
+
+
+def test_an_implant_that_leaves_the_images_is_told() -> None:
+    data = image(scene(CONFIG), CONFIG)
+    mask = torch.zeros_like(data.mask)
+    mask[:, :70] = True
+    result = registered(replace(data, mask=mask))
+    assert min(result.diagnostics["seen"]) < 0.3
+    assert any("is seen in view" in reason for reason in result.warnings)
+
+
+def test_a_parameter_that_ends_at_its_bound_is_named() -> None:
+    physical = RegistrationConfig(material="steel", stages=(Stage(estimate=("scatter", "blur")),))
+    here = scene(physical)
+    assert Nuisance(here, physical, ("scatter", "blur"), 1.0).at_bounds(0.01) == []
+    with torch.no_grad():
+        here.intensity.get_parameter("scatter").fill_(0.9)
+    assert Nuisance(here, physical, ("scatter", "blur"), 1.0).at_bounds(0.01) == ["scatter"]

@@ -1,0 +1,144 @@
+"""Whether a registration can be trusted: what is measured of it, and what is said about that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+
+from torchkcreg.geometry import transform_points
+
+from .guard import rms_strain
+from .objective import StageObjective
+from .scene import Scene
+from .uncertainty import node_deviation
+
+Status = Literal["ok", "doubtful", "failed"]
+
+# Each threshold is where a simulated population parts best, see docs/verdict.md.
+_UNRELATED, _WEAK = 0.3, 0.6  # gradient correlation
+_NOTHING, _UNEXPLAINED = 0.2, 0.08  # misfit
+_DEVIATION_MM = 0.1
+_SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
+_YIELD = 0.004  # root mean square strain
+_AT_BOUND = 0.01  # of a parameter's range
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What tells a good registration from a bad one.
+
+    Attributes:
+        gc: Gradient correlation of each view.
+        misfit: What the last stage's contrast left unexplained.
+        node_std_mm: Expected root mean square error of the implant's nodes.
+        seen: Share of the implant's volume that each view shows.
+        strain: Root mean square strain of the implant.
+        folds: Whether the deformation folds over somewhere in the implant.
+        converged: Whether the last stage ended before its iterations did.
+        at_bounds: Parameters of the intensity model that ended at a bound.
+        undone: Number of each stage that was undone, from 1 on, and why.
+    """
+
+    gc: list[float]
+    misfit: float
+    node_std_mm: float
+    seen: list[float]
+    strain: float
+    folds: bool = False
+    converged: bool = True
+    at_bounds: list[str] = field(default_factory=list)
+    undone: dict[str, str] = field(default_factory=dict)
+
+
+def judge(found: Diagnostics) -> tuple[Status, list[str]]:
+    """The verdict on a registration, and its reasons in words."""
+    failures, doubts = _failures(found), _doubts(found)
+    status: Status = "failed" if failures else "doubtful" if doubts else "ok"
+    return status, [*failures, *doubts]
+
+
+def _failures(found: Diagnostics) -> list[str]:
+    reasons = []
+    weakest = min(found.gc)
+    if not weakest >= _UNRELATED:
+        reasons.append(
+            f"the implant is not where the images show metal: gradient correlation is {weakest:.2f} in view "
+            f"{found.gc.index(weakest)}, no more than with images of something else (up to {_UNRELATED:g})"
+        )
+    if not found.misfit <= _NOTHING:
+        reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained, as it is by chance")
+    if max(found.seen) < _SEEN:
+        reasons.append(f"no view shows more than {100 * max(found.seen):.0f} % of the implant")
+    if found.folds:
+        reasons.append("the deformation folds over inside the implant")
+    return reasons
+
+
+def _doubts(found: Diagnostics) -> list[str]:
+    reasons = []
+    if _UNRELATED <= min(found.gc) < _WEAK:
+        reasons.append(f"the images agree weakly: gradient correlation is {min(found.gc):.2f}, less than {_WEAK:g}")
+    if _UNEXPLAINED < found.misfit <= _NOTHING:
+        reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained")
+    if not found.node_std_mm <= _DEVIATION_MM:
+        reasons.append(
+            f"the implant's nodes are expected to be off by {found.node_std_mm:.2f} mm (RMS), more than "
+            f"{_DEVIATION_MM:g} mm: views from other sides would help"
+        )
+    hardly = [str(view) for view, share in enumerate(found.seen) if share < _HARDLY_SEEN]
+    if hardly and max(found.seen) >= _SEEN:
+        reasons.append(f"less than {100 * _HARDLY_SEEN:.0f} % of the implant is seen in view {', '.join(hardly)}")
+    if found.strain > _YIELD:
+        reasons.append(f"the implant is strained by {100 * found.strain:.2f} % (RMS), more than metal bears")
+    if not found.converged:
+        reasons.append("the last stage did not converge: it needs more iterations")
+    reasons += [f"{name} ended at its bound" for name in found.at_bounds]
+    # That the first stage, on coarse pixels, does not improve on a good start says nothing.
+    reasons += [f"stage {stage} was undone: {why}" for stage, why in found.undone.items() if stage != "1"]
+    return reasons
+
+
+@torch.no_grad()
+def seen_shares(scene: Scene, objective: StageObjective) -> list[float]:
+    """Share of the implant's volume that projects on pixels that count, a view."""
+    cloud, data = scene.implant.coarsened(4), objective.model.data
+    points = cloud.points.double()
+    world = transform_points(scene.implant_to_world, points + scene.deformation.displacement(points))
+    uv, depth = data.geometry.project(world)
+    rows, cols = data.geometry.det_shape
+    column, row = uv.round().long().unbind(-1)
+    inside = (column >= 0) & (column < cols) & (row >= 0) & (row < rows) & (depth > 0)
+    index = row.clamp(0, rows - 1) * cols + column.clamp(0, cols - 1)
+    counts = inside & data.mask.flatten(1).gather(1, index)
+    return (counts * cloud.masses).sum(-1).div(cloud.masses.sum()).tolist()
+
+
+@torch.no_grad()
+def diagnose(
+    scene: Scene, objective: StageObjective, gc: list[float], *, converged: bool, undone: Mapping[str, str]
+) -> Diagnostics:
+    """What is measured of a scene at the end of its registration.
+
+    Args:
+        scene: At the end.
+        objective: Of the last stage there.
+        gc: Gradient correlation of each view.
+        converged: Whether the last stage ended before its iterations did.
+        undone: Number of each stage that was undone, from 1 on, and why.
+    """
+    rest = objective.model.at_rest
+    points = scene.implant.coarsened(8).points.double()
+    return Diagnostics(
+        gc=gc,
+        misfit=1 - float(objective.similarities(rest).mean()),
+        node_std_mm=node_deviation(objective, rest[0]),
+        seen=seen_shares(scene, objective),
+        strain=rms_strain(scene),
+        folds=bool((scene.deformation.jacobian_determinant(points) <= 0).any()),
+        converged=converged,
+        at_bounds=objective.model.nuisance.at_bounds(_AT_BOUND),
+        undone=dict(undone),
+    )
