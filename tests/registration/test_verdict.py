@@ -7,6 +7,7 @@ import torch
 from small_scene import RIGID, SCREW, image, pose, scene
 
 from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, Trainer
+from torchkcreg.registration.basins import Rival
 from torchkcreg.registration.nuisance import Nuisance
 from torchkcreg.registration.verdict import Diagnostics, judge
 
@@ -21,6 +22,7 @@ BAD = {
     "strain": ("doubtful", 0.01),
     "converged": ("doubtful", False),
     "at_bounds": ("doubtful", ["scatter"]),
+    "rival": ("doubtful", Rival(distance_mm=16.0, misfit=0.011, best_misfit=0.01)),
     "undone": ("doubtful", {"3": "it lost"}),
 }
 

@@ -31,8 +31,8 @@ class Stage(BaseModel):
         margin_mm: What is seen around the implant's projection, mm at the detector; None: the whole detector.
         background: Before the stage, what the model lacks (bone, water) is estimated as a smooth path length, and DRRs
             include it.
-        slide: After a stage of one group, the implant is tried all along its long axis; where it fits better elsewhere,
-            the stage runs again from there.
+        slide: After a stage of one group, the implant is tried all along its long axis; where it fits elsewhere too,
+            the rigid stages run from each place, and what explains the images best goes on.
         screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
             or those found before have their lengths and radius estimated along ("fit").
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.

@@ -37,7 +37,7 @@ class Guard:
 
     def before(self, stage: Stage) -> None:
         """The scene's present state is the one to go back to, and what it explains the mark."""
-        self.state, self.found = self.scene.moving_state(), list(self.scene.found)
+        self.kept = self.scene.kept()
         finest = max(1, round(_PIXEL_MM / self.data.geometry.pixel_spacing[1]))
         self.bin = max(stage.bin, finest)
         self.misfit = misfit(self.scene, self.data, self.config, self.bin)
@@ -48,11 +48,10 @@ class Guard:
         if reason is None:
             now = misfit(self.scene, self.data, self.config, self.bin)
             if now <= _LOST * self.misfit:
+                self.misfit = now
                 return None
             reason = f"it left {100 * now:.1f} % of the images unexplained, {100 * self.misfit:.1f} % before"
-        self.scene.load_state_dict(self.state, strict=False)
-        if self.scene.found != self.found:
-            self.scene.place(self.found, self.config.pitch_mm)
+        self.scene.restore(self.kept, self.config.pitch_mm)
         return reason
 
 

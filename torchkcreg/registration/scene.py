@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchkcreg.deformation import FreeFormDeformation
-from torchkcreg.geometry import fit_rigid
+from torchkcreg.geometry import fit_rigid, transform_points
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
 
 from .found_screw import FoundScrew
@@ -101,6 +101,23 @@ class Scene(nn.Module):
         """A copy of what a registration changes: pose, deformation, parameters of the intensity model."""
         state = self.state_dict()
         return {name: value.clone() for name, value in state.items() if not name.startswith("implant.")}
+
+    def kept(self) -> tuple[dict[str, Tensor], list[FoundScrew]]:
+        """What :meth:`restore` goes back to."""
+        return self.moving_state(), list(self.found)
+
+    def restore(self, kept: tuple[dict[str, Tensor], list[FoundScrew]], pitch: float) -> None:
+        """Goes back to a state, nodes of found screws ``pitch`` mm apart."""
+        state, found = kept
+        self.load_state_dict(state, strict=False)
+        if self.found != found:
+            self.place(found, pitch)
+
+    @torch.no_grad()
+    def nodes(self) -> Tensor:
+        """World positions (N, 3) of a few nodes of the implant, mm."""
+        points = self.implant.coarsened(8).points.double()
+        return transform_points(self.implant_to_world, points + self.deformation.displacement(points))
 
     @torch.no_grad()
     def component_motions(self) -> dict[str, Tensor]:

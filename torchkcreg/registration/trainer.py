@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchkcreg.geometry import transform_points
 
 from .background import with_background
+from .basins import Rival, places
 from .callbacks import Callback
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
@@ -22,7 +26,6 @@ from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
 from .screws import find_screws
-from .slide import slid
 from .verdict import Diagnostics, diagnose, judge
 
 
@@ -63,6 +66,7 @@ class Trainer:
         self.next_stage = 0
         self.history: list[dict[str, Any]] = []
         self.undone: dict[str, str] = {}
+        self.rival: Rival | None = None
         self._guard: Guard | None = None
 
     def check(self) -> None:
@@ -72,9 +76,14 @@ class Trainer:
 
     def fit(self) -> RegistrationResult:
         """Runs the stages that are left and returns the result."""
+        self.run()
+        return self._result()
+
+    def run(self) -> float:
+        """Runs the stages that are left; what of the images they leave unexplained."""
         while self.next_stage < len(self.stages):
             self._run_stage(self.next_stage)
-        return self._result()
+        return self._guard.misfit if self._guard else math.nan
 
     def _run_stage(self, index: int) -> None:
         stage, start = self.stages[index], time.perf_counter()
@@ -94,16 +103,38 @@ class Trainer:
                 callback.on_iteration(self, index, progress)
 
         found = minimize(objective, stage, seed=self.config.seed + index, report=report)
-        if stage.slide and (elsewhere := slid(objective, found)) is not None:
-            objective.accept(elsewhere)
-            objective = stage_objective(self.scene, self.data, stage, self.config)
-            found = minimize(objective, stage, seed=self.config.seed + index, report=report)
-        objective.accept(found)
+        if stage.slide:
+            self._try_places(index, objective, found)
+        else:
+            objective.accept(found)
         if (reason := self._guard.after()) is not None:
             self.undone[str(index + 1)] = reason
         self.next_stage = index + 1
         for callback in self.callbacks:
             callback.on_stage_end(self, index, stage)
+
+    def _try_places(self, index: int, objective: StageObjective, found: Tensor) -> None:
+        """Moves the scene to the place from which the rigid stages explain the images best."""
+        candidates = places(objective, found)
+        if len(candidates) == 1:
+            return objective.accept(found)
+        before, ends = self.scene.kept(), []
+        config = self.config.model_copy(update={"stages": self._rigid_stages(index)})
+        for candidate in candidates:
+            self.scene.restore(before, self.config.pitch_mm)
+            objective.accept(candidate)
+            trial = Trainer(self.scene, self.data, config)
+            ends.append((trial.run(), self.scene.nodes(), self.scene.kept()))
+        (best, nodes, state), (second, elsewhere, _), *_ = sorted(ends, key=lambda end: end[0])
+        self.scene.restore(state, self.config.pitch_mm)
+        distance = float((nodes - elsewhere).square().sum(-1).mean().sqrt())
+        self.rival = Rival(distance_mm=distance, misfit=second, best_misfit=best)
+        return None
+
+    def _rigid_stages(self, index: int) -> tuple[Stage, ...]:
+        """A stage's own, without a look elsewhere, and those that follow it and keep the implant rigid."""
+        following = itertools.takewhile(lambda s: s.groups == 1 and s.modes is None, self.stages[index + 1 :])
+        return (self.stages[index].model_copy(update={"slide": False}), *following)
 
     def _look_for_screws(self, stage: Stage) -> None:
         if stage.screws != "find" or not self.scene.holes:
@@ -142,7 +173,7 @@ class Trainer:
         objective = stage_objective(self.scene, self.data, coarse, self.config)
         ended = self.history[-1] if self.history else {"iteration": 0, "step_mm": 0.0}
         converged = ended["iteration"] < last.iterations or ended["step_mm"] < 10 * last.tolerance
-        return diagnose(self.scene, objective, gc, converged=converged, undone=self.undone)
+        return diagnose(self.scene, objective, gc, converged=converged, undone=self.undone, rival=self.rival)
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain types that :meth:`load_state_dict` continues from."""
@@ -152,6 +183,7 @@ class Trainer:
             "history": self.history,
             "screws": [asdict(screw) for screw in self.scene.found],
             "undone": self.undone,
+            "rival": None if self.rival is None else asdict(self.rival),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -169,3 +201,4 @@ class Trainer:
             self.scene.place([FoundScrew(**screw) for screw in state["screws"]], self.config.pitch_mm)
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])
         self.undone = dict(state["undone"])
+        self.rival = None if state["rival"] is None else Rival(**state["rival"])

@@ -10,6 +10,7 @@ import torch
 
 from torchkcreg.geometry import transform_points
 
+from .basins import Rival
 from .guard import rms_strain
 from .objective import StageObjective
 from .scene import Scene
@@ -23,6 +24,7 @@ _NOTHING, _UNEXPLAINED = 0.2, 0.08  # misfit
 _DEVIATION_MM = 0.1
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.004  # root mean square strain
+_APART_MM, _ALIKE = 2.0, 1.2  # another place, and how much more it leaves unexplained
 _AT_BOUND = 0.01  # of a parameter's range
 
 
@@ -40,6 +42,7 @@ class Diagnostics:
         converged: Whether the last stage ended before its iterations did.
         at_bounds: Parameters of the intensity model that ended at a bound.
         undone: Number of each stage that was undone, from 1 on, and why.
+        rival: Where the implant fitted second best, if several places were tried.
     """
 
     gc: list[float]
@@ -51,6 +54,7 @@ class Diagnostics:
     converged: bool = True
     at_bounds: list[str] = field(default_factory=list)
     undone: dict[str, str] = field(default_factory=dict)
+    rival: Rival | None = None
 
 
 def judge(found: Diagnostics) -> tuple[Status, list[str]]:
@@ -96,6 +100,9 @@ def _doubts(found: Diagnostics) -> list[str]:
     if not found.converged:
         reasons.append("the last stage did not converge: it needs more iterations")
     reasons += [f"{name} ended at its bound" for name in found.at_bounds]
+    rival = found.rival
+    if rival and rival.distance_mm > _APART_MM and rival.misfit < _ALIKE * rival.best_misfit:
+        reasons.append(f"the implant fits nearly as well {rival.distance_mm:.1f} mm away")
     # That the first stage, on coarse pixels, does not improve on a good start says nothing.
     reasons += [f"stage {stage} was undone: {why}" for stage, why in found.undone.items() if stage != "1"]
     return reasons
@@ -118,7 +125,13 @@ def seen_shares(scene: Scene, objective: StageObjective) -> list[float]:
 
 @torch.no_grad()
 def diagnose(
-    scene: Scene, objective: StageObjective, gc: list[float], *, converged: bool, undone: Mapping[str, str]
+    scene: Scene,
+    objective: StageObjective,
+    gc: list[float],
+    *,
+    converged: bool,
+    undone: Mapping[str, str],
+    rival: Rival | None,
 ) -> Diagnostics:
     """What is measured of a scene at the end of its registration.
 
@@ -128,6 +141,7 @@ def diagnose(
         gc: Gradient correlation of each view.
         converged: Whether the last stage ended before its iterations did.
         undone: Number of each stage that was undone, from 1 on, and why.
+        rival: Where the implant fitted second best, if several places were tried.
     """
     rest = objective.model.at_rest
     points = scene.implant.coarsened(8).points.double()
@@ -141,4 +155,5 @@ def diagnose(
         converged=converged,
         at_bounds=objective.model.nuisance.at_bounds(_AT_BOUND),
         undone=dict(undone),
+        rival=rival,
     )
