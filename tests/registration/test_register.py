@@ -89,7 +89,8 @@ def test_a_checkpoint_of_another_grid_is_refused() -> None:
 
 
 def test_the_background_behind_the_implant_is_that_around_it() -> None:
-    config = PLAIN.model_copy(update={"material": "steel", "scatter": 0.05, "background_material": "cortical_bone"})
+    physics = {"material": "steel", "scatter": 0.05, "background_material": "cortical_bone", "background_mm": 4.0}
+    config = PLAIN.model_copy(update=physics)
     here = scene(config, components=[SCREW])
     bone = torch.full((3, 160, 96), 20.0)
     modelled = image(here, config, background=bone)

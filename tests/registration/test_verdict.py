@@ -58,6 +58,12 @@ def test_the_right_images_are_ok() -> None:
     assert result.diagnostics["node_std_mm"] < 0.1
 
 
+def test_what_explains_little_and_is_held_by_little_fails() -> None:
+    status, reasons = judge(replace(GOOD, misfit=0.3, node_std_mm=0.6))
+    assert status == "failed"
+    assert "something else" in reasons[0]
+
+
 @pytest.mark.parametrize("what", ["blank", "flipped", "noise"])
 def test_images_of_something_else_fail(what: str) -> None:
     data = image(scene(CONFIG), CONFIG)

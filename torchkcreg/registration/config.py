@@ -157,13 +157,13 @@ class RegistrationConfig(BaseModel):
     grid_spacing_mm: tuple[float, float, float] = (8.75, 8.75, 17.5)
     beta: float = Field(1e-4, ge=0)
     stiffness: float = Field(30.0, ge=0)
-    load_weight: float = Field(1e-9, ge=0)
+    load_weight: float = Field(3e-9, ge=0)
     prior_weight: float = Field(5e-4, ge=0)
     youngs_modulus_gpa: float = Field(200.0, gt=0)
     scatter: float = Field(0.08, ge=0, lt=1)
     scatter_mm: float = Field(25.0, gt=0)
     blur_px: float = Field(0.7, ge=0)
-    background_mm: float = Field(4.0, gt=0)
+    background_mm: float = Field(2.5, gt=0)
     background_material: str = "soft_tissue"
     find_screws: bool = True
     follow_radius_mm: float = Field(8.0, gt=0)

@@ -132,9 +132,10 @@ class Trainer:
         return None
 
     def _rigid_stages(self, index: int) -> tuple[Stage, ...]:
-        """A stage's own, without a look elsewhere, and those that follow it and keep the implant rigid."""
+        """A stage's own and those that follow it and keep the implant rigid, without a look for places or screws."""
         following = itertools.takewhile(lambda s: s.groups == 1 and s.modes is None, self.stages[index + 1 :])
-        return (self.stages[index].model_copy(update={"slide": False}), *following)
+        bare = {"slide": False, "screws": None}
+        return tuple(stage.model_copy(update=bare) for stage in (self.stages[index], *following))
 
     def _look_for_screws(self, stage: Stage) -> None:
         if stage.screws != "find" or not self.scene.holes:

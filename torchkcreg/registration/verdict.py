@@ -21,9 +21,9 @@ Status = Literal["ok", "doubtful", "failed"]
 # Each threshold is where a simulated population parts best, see docs/verdict.md.
 _UNRELATED, _WEAK = 0.3, 0.6  # gradient correlation
 _NOTHING, _UNEXPLAINED = 0.2, 0.08  # misfit
-_DEVIATION_MM = 0.1
+_DEVIATION_MM, _ANYWHERE_MM = 0.1, 0.4
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
-_YIELD = 0.004  # root mean square strain
+_YIELD = 0.0035  # root mean square strain
 _APART_MM, _ALIKE = 2.0, 1.2  # another place, and how much more it leaves unexplained
 _AT_BOUND = 0.01  # of a parameter's range
 
@@ -72,8 +72,11 @@ def _failures(found: Diagnostics) -> list[str]:
             f"the implant is not where the images show metal: gradient correlation is {weakest:.2f} in view "
             f"{found.gc.index(weakest)}, no more than with images of something else (up to {_UNRELATED:g})"
         )
-    if not found.misfit <= _NOTHING:
-        reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained, as it is by chance")
+    if not found.misfit <= _NOTHING and not found.node_std_mm <= _ANYWHERE_MM:
+        reasons.append(
+            f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained and the nodes are expected to be "
+            f"off by {found.node_std_mm:.1f} mm (RMS), as with images of something else"
+        )
     if max(found.seen) < _SEEN:
         reasons.append(f"no view shows more than {100 * max(found.seen):.0f} % of the implant")
     if found.folds:
@@ -85,7 +88,7 @@ def _doubts(found: Diagnostics) -> list[str]:
     reasons = []
     if _UNRELATED <= min(found.gc) < _WEAK:
         reasons.append(f"the images agree weakly: gradient correlation is {min(found.gc):.2f}, less than {_WEAK:g}")
-    if _UNEXPLAINED < found.misfit <= _NOTHING:
+    if found.misfit > _UNEXPLAINED:
         reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained")
     if not found.node_std_mm <= _DEVIATION_MM:
         reasons.append(
