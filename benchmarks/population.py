@@ -45,16 +45,12 @@ Job = tuple[int, str, bool, dict[str, Any], str, str]
 class _ErrorsOfStages(Callback):
     """Node RMSE after each stage, and the loss there."""
 
-    def __init__(self, nodes: torch.Tensor, truth: torch.Tensor) -> None:
-        self.nodes, self.truth = nodes, truth
+    def __init__(self, truth: torch.Tensor) -> None:
+        self.truth = truth
         self.errors: list[str] = []
 
     def on_stage_end(self, trainer: Trainer, index: int, stage: Any) -> None:
-        scene = trainer.scene
-        with torch.no_grad():
-            moved = self.nodes + scene.deformation.displacement(self.nodes)
-        pose = scene.implant_to_world
-        error = float(bb_rmse(moved @ pose[:3, :3].T + pose[:3, 3], self.truth))
+        error = float(bb_rmse(trainer.scene.nodes(), self.truth))
         self.errors.append(f"{error:.3f}/{trainer.history[-1]['loss']:.4f}")
 
 
@@ -87,7 +83,7 @@ def register_case(
         components=screws if known else (),
         holes=find_holes(case.implant),
     )
-    trace = _ErrorsOfStages(nodes, truth)
+    trace = _ErrorsOfStages(truth)
     result = Trainer(scene, data, config, callbacks=[trace]).fit()
     errors = result.warp(nodes) - truth
     ray = case.geometry.source_positions.double().mean(0) - nodes.mean(0)

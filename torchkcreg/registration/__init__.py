@@ -5,12 +5,12 @@ from .callbacks import Callback, ProgressBar
 from .config import RegistrationConfig, Stage, preset_stages
 from .data import RegistrationData
 from .model import StageModel
-from .objective import StageObjective
+from .objective import StageObjective, stage_objective
 from .register import build_scene, register
 from .result import RegistrationResult
 from .scene import Scene
 from .screws import find_screws
-from .trainer import Trainer, stage_objective
+from .trainer import Trainer
 
 __all__ = [
     "Callback",

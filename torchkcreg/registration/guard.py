@@ -9,10 +9,9 @@ from torch import Tensor
 
 from torchkcreg.geometry import transform_points, vector_from_rotation
 
-from .background import with_background
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
-from .objective import StageObjective
+from .objective import stage_objective
 from .scene import Scene
 
 _PIXEL_MM = 1.5  # nothing finer is needed to see that a stage went astray
@@ -34,13 +33,14 @@ class Guard:
     def __init__(self, scene: Scene, data: RegistrationData, config: RegistrationConfig) -> None:
         self.scene, self.data, self.config = scene, data, config
         self.first_pose = scene.implant_to_world.clone()
+        self.bin, self.misfit = 0, math.nan
 
     def before(self, stage: Stage) -> None:
         """The scene's present state is the one to go back to, and what it explains the mark."""
         self.kept = self.scene.kept()
         finest = max(1, round(_PIXEL_MM / self.data.geometry.pixel_spacing[1]))
-        self.bin = max(stage.bin, finest)
-        self.misfit = misfit(self.scene, self.data, self.config, self.bin)
+        if (bin := max(stage.bin, finest)) != self.bin:  # else it is known from the end of the stage before
+            self.bin, self.misfit = bin, misfit(self.scene, self.data, self.config, bin)
 
     def after(self) -> str | None:
         """Why the stage was undone, or None where it stands."""
@@ -61,10 +61,8 @@ def misfit(scene: Scene, data: RegistrationData, config: RegistrationConfig, bin
 
     1 - GD with the background that goes with the scene, or 1 - GC where DRRs are path lengths; all pixels alike.
     """
-    stage = Stage(groups=scene.num_groups, bin=bin, pitch_factor=2, margin_mm=12.0, contrast=True)
-    if scene.is_polyenergetic:
-        data = with_background(scene, data, config)
-    objective = StageObjective(scene, data, stage, config)
+    stage = Stage(groups=scene.num_groups, bin=bin, pitch_factor=2, margin_mm=12.0, background=True, contrast=True)
+    objective = stage_objective(scene, data, stage, config)
     return 1 - float(objective.similarities(objective.model.at_rest).mean())
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchkcreg.deformation import control_points_from_groups, diffusion_penalty
 from torchkcreg.similarity import GradientCorrelation, GradientDifference, sobel_gradient
 
+from .background import with_background
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
 from .elasticity import ModalMotion
@@ -125,3 +126,19 @@ class StageObjective:
         self.model.nuisance.accept(physics)
         if self.model.screws:
             self.scene.place(self.model.screws.stepped(shapes), self.config.pitch_mm)
+
+
+def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
+    """The objective of a stage at the scene's present state, with the background that the stage asks for."""
+    data = with_scatter_shape(scene, data, config)
+    if stage.background and scene.is_polyenergetic:
+        follows = [name for name in stage.estimate if name != "blur"]
+        data = with_background(scene, data, config, follows=follows)
+    return StageObjective(scene, data, stage, config)
+
+
+def with_scatter_shape(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
+    """The data with a shape of the scatter, where the intensity model has scatter."""
+    if not scene.is_polyenergetic or data.scatter_shape is not None:
+        return data
+    return data.with_scatter_shape(config.scatter_mm)

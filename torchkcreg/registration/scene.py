@@ -114,9 +114,9 @@ class Scene(nn.Module):
             self.place(found, pitch)
 
     @torch.no_grad()
-    def nodes(self) -> Tensor:
-        """World positions (N, 3) of a few nodes of the implant, mm."""
-        points = self.implant.coarsened(8).points.double()
+    def nodes(self, coarsening: int = 8) -> Tensor:
+        """World positions (N, 3) of the implant's nodes on a lattice that many times coarser, mm."""
+        points = self.implant.coarsened(coarsening).points.double()
         return transform_points(self.implant_to_world, points + self.deformation.displacement(points))
 
     @torch.no_grad()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,35 +13,18 @@ from torch import Tensor
 
 from torchkcreg.geometry import transform_points
 
-from .background import with_background
 from .basins import Rival, places
 from .callbacks import Callback
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData
 from .found_screw import FoundScrew
 from .guard import Guard
-from .objective import StageObjective
+from .objective import StageObjective, stage_objective, with_scatter_shape
 from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
 from .screws import find_screws
 from .verdict import Diagnostics, diagnose, judge
-
-
-def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
-    """The objective of a stage at the scene's present state, with the background that the stage asks for."""
-    data = with_scatter_shape(scene, data, config)
-    if stage.background and scene.is_polyenergetic:
-        follows = [name for name in stage.estimate if name != "blur"]
-        data = with_background(scene, data, config, follows=follows)
-    return StageObjective(scene, data, stage, config)
-
-
-def with_scatter_shape(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
-    """The data with a shape of the scatter, where the intensity model has scatter."""
-    if not scene.is_polyenergetic or data.scatter_shape is not None:
-        return data
-    return data.with_scatter_shape(config.scatter_mm)
 
 
 class Trainer:
@@ -61,13 +43,14 @@ class Trainer:
     def __init__(
         self, scene: Scene, data: RegistrationData, config: RegistrationConfig, *, callbacks: Sequence[Callback] = ()
     ) -> None:
-        self.scene, self.data, self.config, self.callbacks = scene, data, config, list(callbacks)
+        self.scene, self.config, self.callbacks = scene, config, list(callbacks)
+        self.data = with_scatter_shape(scene, data, config)
         self.stages = config.schedule()
         self.next_stage = 0
         self.history: list[dict[str, Any]] = []
         self.undone: dict[str, str] = {}
         self.rival: Rival | None = None
-        self._guard: Guard | None = None
+        self._guard = Guard(scene, self.data, config)
 
     def check(self) -> None:
         """Raises ValueError if the implant lies outside every view at its start pose."""
@@ -83,12 +66,10 @@ class Trainer:
         """Runs the stages that are left; what of the images they leave unexplained."""
         while self.next_stage < len(self.stages):
             self._run_stage(self.next_stage)
-        return self._guard.misfit if self._guard else math.nan
+        return self._guard.misfit
 
     def _run_stage(self, index: int) -> None:
         stage, start = self.stages[index], time.perf_counter()
-        if self._guard is None:
-            self._guard = Guard(self.scene, with_scatter_shape(self.scene, self.data, self.config), self.config)
         for callback in self.callbacks:
             callback.on_stage_start(self, index, stage)
         self._guard.before(stage)
@@ -140,8 +121,7 @@ class Trainer:
     def _look_for_screws(self, stage: Stage) -> None:
         if stage.screws != "find" or not self.scene.holes:
             return
-        data = with_scatter_shape(self.scene, self.data, self.config)
-        self.scene.place(find_screws(self.scene, data, self.config, bin=stage.bin), self.config.pitch_mm)
+        self.scene.place(find_screws(self.scene, self.data, self.config, bin=stage.bin), self.config.pitch_mm)
 
     def _result(self) -> RegistrationResult:
         scene = self.scene
@@ -197,9 +177,8 @@ class Trainer:
         unknown = [n for n, v in state["scene"].items() if n not in own or own[n].shape != v.shape]
         if unknown:
             raise ValueError(f"the checkpoint does not fit this registration: {', '.join(unknown)} differ")
-        self.scene.load_state_dict(state["scene"], strict=False)
-        if self.scene.holes:
-            self.scene.place([FoundScrew(**screw) for screw in state["screws"]], self.config.pitch_mm)
+        found = [FoundScrew(**screw) for screw in state["screws"]]
+        self.scene.restore((state["scene"], found), self.config.pitch_mm)
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])
         self.undone = dict(state["undone"])
         self.rival = None if state["rival"] is None else Rival(**state["rival"])

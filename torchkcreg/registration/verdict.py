@@ -8,8 +8,6 @@ from typing import Literal
 
 import torch
 
-from torchkcreg.geometry import transform_points
-
 from .basins import Rival
 from .guard import rms_strain
 from .objective import StageObjective
@@ -114,16 +112,14 @@ def _doubts(found: Diagnostics) -> list[str]:
 @torch.no_grad()
 def seen_shares(scene: Scene, objective: StageObjective) -> list[float]:
     """Share of the implant's volume that projects on pixels that count, a view."""
-    cloud, data = scene.implant.coarsened(4), objective.model.data
-    points = cloud.points.double()
-    world = transform_points(scene.implant_to_world, points + scene.deformation.displacement(points))
-    uv, depth = data.geometry.project(world)
+    masses, data = scene.implant.coarsened(4).masses, objective.model.data
+    uv, depth = data.geometry.project(scene.nodes(4))
     rows, cols = data.geometry.det_shape
     column, row = uv.round().long().unbind(-1)
     inside = (column >= 0) & (column < cols) & (row >= 0) & (row < rows) & (depth > 0)
     index = row.clamp(0, rows - 1) * cols + column.clamp(0, cols - 1)
     counts = inside & data.mask.flatten(1).gather(1, index)
-    return (counts * cloud.masses).sum(-1).div(cloud.masses.sum()).tolist()
+    return (counts * masses).sum(-1).div(masses.sum()).tolist()
 
 
 @torch.no_grad()

@@ -48,7 +48,35 @@ def gradient_correlation(moving: Tensor, fixed: Tensor, *, mask: Tensor | None =
     return in_blocks(lambda block: _correlate(block, unit_fixed, mask, eroded), moving, whole=fixed.ndim > 3)
 
 
-class GradientCorrelation(nn.Module):
+class OfGradients(nn.Module):
+    """What similarities of gradients know of the measured images: which pixels count, and the gradients there.
+
+    Args:
+        fixed, mask, weights: see `GradientCorrelation`.
+    """
+
+    unit_gradients: Tensor
+    mask: Tensor | None
+    eroded_mask: Tensor | None
+
+    def __init__(self, fixed: Tensor, mask: Tensor | None, weights: Tensor | None) -> None:
+        super().__init__()
+        mask, eroded = _weights_of_pixels(fixed, mask, weights)
+        self.register_buffer("mask", mask)
+        self.register_buffer("eroded_mask", eroded)
+
+    @property
+    def num_views(self) -> int:
+        """Number of views V."""
+        return self.unit_gradients.shape[0]
+
+    def in_blocks(self, function: Callable[[Tensor], Tensor], moving: Tensor) -> Tensor:
+        """`function` of rendered images (..., V, rows, cols), checked against the measured ones."""
+        check_images(moving, self.unit_gradients[:, 0])
+        return in_blocks(function, moving)
+
+
+class GradientCorrelation(OfGradients):
     """Gradient correlation with measured images whose side of the work is done once.
 
     Args:
@@ -72,26 +100,13 @@ class GradientCorrelation(nn.Module):
         (torch.Size([5, 3]), torch.Size([5, 3, 2, 16, 16]))
     """
 
-    unit_gradients: Tensor
-    mask: Tensor | None
-    eroded_mask: Tensor | None
-
     def __init__(self, fixed: Tensor, mask: Tensor | None = None, weights: Tensor | None = None) -> None:
-        super().__init__()
-        mask, eroded = weights_of_pixels(fixed, mask, weights)
-        self.register_buffer("mask", mask)
-        self.register_buffer("eroded_mask", eroded)
-        self.register_buffer("unit_gradients", _unit_gradients(fixed.detach(), mask, eroded))
-
-    @property
-    def num_views(self) -> int:
-        """Number of views V."""
-        return self.unit_gradients.shape[0]
+        super().__init__(fixed, mask, weights)
+        self.register_buffer("unit_gradients", _unit_gradients(fixed.detach(), self.mask, self.eroded_mask))
 
     def forward(self, moving: Tensor) -> Tensor:
         """GC of each view, shape (..., V), of rendered images (..., V, rows, cols)."""
-        check_images(moving, self.unit_gradients[:, 0])
-        return in_blocks(lambda b: _correlate(b, self.unit_gradients, self.mask, self.eroded_mask), moving)
+        return self.in_blocks(lambda b: _correlate(b, self.unit_gradients, self.mask, self.eroded_mask), moving)
 
     def residuals(self, moving: Tensor) -> Tensor:
         """Differences of the unit gradients of `moving` and of the fixed images, for least-squares methods.
@@ -106,7 +121,6 @@ class GradientCorrelation(nn.Module):
         Returns:
             Tensor of shape (..., V, 2, rows, cols).
         """
-        check_images(moving, self.unit_gradients[:, 0])
         fixed_says = (self.unit_gradients != 0).any(-1).any(-1)[..., None, None]
 
         def difference(block: Tensor) -> Tensor:
@@ -115,7 +129,7 @@ class GradientCorrelation(nn.Module):
             target = torch.where(flat, math.sqrt(2.0), 1.0).to(self.unit_gradients.dtype) * self.unit_gradients
             return unit * fixed_says - target
 
-        return in_blocks(difference, moving)
+        return self.in_blocks(difference, moving)
 
 
 class GradientCorrelationLoss(nn.Module):
@@ -152,7 +166,7 @@ def _unit_gradients(images: Tensor, mask: Tensor | None, eroded: Tensor | None) 
     return unit_contrast(sobel_gradient(images), None if eroded is None else eroded[..., None, :, :], scale)
 
 
-def weights_of_pixels(
+def _weights_of_pixels(
     fixed: Tensor, mask: Tensor | None, weights: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None]:
     """The mask as booleans, and how much each pixel's derivatives count, checked against the fixed images."""

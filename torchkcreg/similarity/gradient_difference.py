@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchkcreg.similarity.gradient_correlation import check_images, in_blocks, weights_of_pixels
+from torchkcreg.similarity.gradient_correlation import OfGradients
 from torchkcreg.similarity.ncc import largest_value
 from torchkcreg.similarity.sobel import sobel_gradient
 
 
-class GradientDifference(nn.Module):
+class GradientDifference(OfGradients):
     """How near the gradients of rendered images come to those of measured ones, 1 for a perfect match.
 
     ``GD = 1 - sum_d |d y - d y*|^2 / (4 |d y*|^2)`` over the Sobel derivatives d along u and v, their means taken out.
@@ -30,16 +30,10 @@ class GradientDifference(nn.Module):
     [[1.0, 1.0, 1.0], [0.5, 0.5, 0.5]]
     """
 
-    unit_gradients: Tensor
     inverse_norms: Tensor
-    mask: Tensor | None
-    eroded_mask: Tensor | None
 
     def __init__(self, fixed: Tensor, mask: Tensor | None = None, weights: Tensor | None = None) -> None:
-        super().__init__()
-        mask, eroded = weights_of_pixels(fixed, mask, weights)
-        self.register_buffer("mask", mask)
-        self.register_buffer("eroded_mask", eroded)
+        super().__init__(fixed, mask, weights)
         contrast = self._contrast(fixed.detach())
         norms = torch.linalg.vector_norm(contrast, dim=(-2, -1), keepdim=True)
         rounding = 16 * torch.finfo(fixed.dtype).eps * contrast[0, 0].numel() ** 0.5
@@ -49,13 +43,11 @@ class GradientDifference(nn.Module):
 
     def forward(self, moving: Tensor) -> Tensor:
         """GD of each view, shape (..., V), of rendered images (..., V, rows, cols)."""
-        check_images(moving, self.unit_gradients[:, 0])
-        return in_blocks(lambda block: 1 - 0.25 * self._residuals(block).square().sum((-3, -2, -1)), moving)
+        return self.in_blocks(lambda block: 1 - 0.25 * self._residuals(block).square().sum((-3, -2, -1)), moving)
 
     def residuals(self, moving: Tensor) -> Tensor:
         """Differences of the gradients (..., V, 2, rows, cols), whose squares sum to 4 (1 - GD)."""
-        check_images(moving, self.unit_gradients[:, 0])
-        return in_blocks(self._residuals, moving)
+        return self.in_blocks(self._residuals, moving)
 
     def _residuals(self, moving: Tensor) -> Tensor:
         return self._contrast(moving) * self.inverse_norms - self.unit_gradients
