@@ -65,7 +65,7 @@ def test_screws_are_not_looked_for_where_that_is_not_wanted(mesh: trimesh.Trimes
 
 def test_shapes_are_the_slopes_of_the_images(mesh: trimesh.Trimesh) -> None:
     model = StageModel(scene_of(mesh), image(scene_of(mesh), CONFIG), CONFIG.stages[0], CONFIG)
-    shapes = ScrewShapes([TRUE], model.screw_path)
+    shapes = ScrewShapes([TRUE], model.screw_path, torch.zeros(1, 3, dtype=torch.float64))
     longer = shapes(torch.tensor([[0.4, 0.0]], dtype=torch.float64))[0]
     (stepped,) = shapes.stepped(torch.tensor([0.4, 0.0], dtype=torch.float64))
     assert stepped.length == pytest.approx(TRUE.length + 0.4)

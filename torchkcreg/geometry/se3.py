@@ -95,6 +95,17 @@ def _assemble(rotation: Tensor, translation: Tensor) -> Tensor:
     return torch.cat([top, last.expand(*batch, 1, 4)], dim=-2)
 
 
+def rotation_about(center: Tensor, rotation_vector: Tensor) -> Tensor:
+    """Rigid transforms (..., 4, 4) that turn by rotation vectors (..., 3) about centres (..., 3).
+
+    >>> half_turn = rotation_about(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, torch.pi]))
+    >>> transform_points(half_turn, torch.zeros(1, 3)).round().abs().tolist()
+    [[2.0, 0.0, 0.0]]
+    """
+    turn = rotation_from_vector(rotation_vector)
+    return _assemble(turn, center - (turn @ center[..., None])[..., 0])
+
+
 def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
     """Points (..., N, 3) moved by affine transforms (..., 4, 4), leading dimensions broadcast; in the points' dtype.
 

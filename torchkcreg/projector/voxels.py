@@ -215,7 +215,7 @@ def _checked_matrices(grid: VolumeGrid, matrices: Tensor, data: Tensor) -> Tenso
         raise ValueError(f"projection_matrices must be on the data's device {data.device}, got {matrices.device}")
     if matrices.requires_grad:
         raise ValueError("projection_matrices must not require a gradient: they count as constant, detach them")
-    matrices = matrices.double()
+    matrices = matrices.double().contiguous()  # another layout may round otherwise
     if not bool(matrices.isfinite().all()):
         raise ValueError("projection_matrices must be finite")
     normals = matrices[:, :, :3].norm(dim=-1, keepdim=True)

@@ -59,7 +59,7 @@ class _BackgroundFit:
         self.stage = Stage(groups=scene.num_groups, bin=min(max(coarse, 1), 4), pitch_factor=2, margin_mm=None)
         self.model = StageModel(scene, bare, self.stage, config)
         self.intensity = scene.intensity
-        self.physics = self.model.nuisance(self.model.split(self.model.at_rest)[1])
+        self.physics = self.model.nuisance(self.model.split(self.model.at_rest).physics)
         self.paths = self.model.path_lengths(self.model.at_rest)[:, :-1]
         self.measured = torch.exp(-self.model.data.line_integrals)
         self.sigma = config.background_mm / self.model.data.geometry.pixel_spacing[1]

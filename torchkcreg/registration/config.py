@@ -35,6 +35,7 @@ class Stage(BaseModel):
             the rigid stages run from each place, and what explains the images best goes on.
         screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
             or those found before have their lengths and radius estimated along ("fit").
+        tilts: Components may turn a little about their heads, see :class:`ComponentTilts`.
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
         contrast: The images' contrast counts too (:class:`torchkcreg.similarity.GradientDifference`), not only its
             shape (gradient correlation).
@@ -57,6 +58,7 @@ class Stage(BaseModel):
     background: bool = False
     slide: bool = False
     screws: Literal["find", "fit"] | None = None
+    tilts: bool = False
     robust: bool = False
     contrast: bool = False
     estimate: tuple[NuisanceName, ...] = ()
@@ -95,9 +97,9 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         Stage(bin=8, pitch_factor=4, screws="find"),
         Stage(bin=4, screws="find", estimate=("scatter", "hardness"), **seen),
         Stage(groups=2, bin=4, screws="find", estimate=physics, **seen),
-        Stage(groups=2, bin=2, estimate=physics, robust=True, screws="fit", **seen),
-        Stage(groups=20, modes=40, bin=2, estimate=physics, robust=True, screws="fit", **seen),
-        Stage(groups=20, modes=40, bin=1, estimate=physics, robust=True, screws="fit", **seen),
+        Stage(groups=2, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
+        Stage(groups=20, modes=40, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
+        Stage(groups=20, modes=40, bin=1, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}

@@ -62,18 +62,23 @@ class ScrewShapes:
 
     Args:
         screws: The screws.
-        render: Path lengths (..., V, rows, cols) of a screw where it now is.
+        render: Path lengths (..., V, rows, cols) of a screw where it now is, tilted by a rotation vector (3,).
+        tilts: The screws' tilts, shape (n, 3).
     """
 
-    def __init__(self, screws: Sequence[FoundScrew], render: Callable[[FoundScrew], Tensor]) -> None:
+    def __init__(
+        self, screws: Sequence[FoundScrew], render: Callable[[FoundScrew, Tensor], Tensor], tilts: Tensor
+    ) -> None:
         self.screws = list(screws)
+        tilted = list(zip(self.screws, tilts, strict=True))
         longer, thicker = _LENGTH_STEP_MM, _RADIUS_STEP_MM
         slopes = [
-            (render(s.with_length(s.length + longer)) - render(s.with_length(s.length - longer))) / (2 * longer)
-            for s in self.screws
+            (render(s.with_length(s.length + longer), t) - render(s.with_length(s.length - longer), t)) / (2 * longer)
+            for s, t in tilted
         ]
         swelling = [
-            render(s.with_radius(s.radius + thicker)) - render(s.with_radius(s.radius - thicker)) for s in screws
+            render(s.with_radius(s.radius + thicker), t) - render(s.with_radius(s.radius - thicker), t)
+            for s, t in tilted
         ]
         slopes.append(torch.stack(swelling).sum(0) * (_RADIUS_UNIT_MM / (2 * thicker)))
         self.slopes = torch.stack(slopes)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchkcreg.deformation import cluster_control_points, control_point_masses, group_centers, group_moments
-from torchkcreg.geometry import fit_rigid, transform_points
+from torchkcreg.geometry import fit_rigid, rotation_about, transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.projector import cell_footprint, project_points
 
@@ -19,6 +20,7 @@ from .found_screw import FoundScrew, ScrewShapes
 from .motion import GroupMotion
 from .nuisance import Nuisance
 from .scene import Scene
+from .tilts import ComponentTilts
 
 _SCREW_PITCH_MM = 0.5
 _COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
@@ -32,6 +34,15 @@ class _MaterialCloud:
     holds_implant: bool
     components: list[tuple[int, Tensor]]  # index in the scene, nodes in the implant's frame
     masses: Tensor
+
+
+class Blocks(NamedTuple):
+    """Parameters of the motion, of the intensity model, of the shapes of found screws and of components' tilts."""
+
+    motion: Tensor
+    physics: Tensor
+    shapes: Tensor
+    tilts: Tensor
 
 
 @dataclass(frozen=True)
@@ -50,8 +61,8 @@ class StageModel:
     """DRRs of whole batches of candidates at a stage's image scale.
 
     Parameters are increments in mm to the scene's state when the model is made: six a group or one an elastic mode,
-    then the estimated parameters of the intensity model. Node weights are computed here, once: the displacement of a
-    node is linear in the groups' motions, ``u = sum_g W_g t_g + (R_g - I) M_g``.
+    then those of the intensity model, of found screws and of components' tilts, see `Blocks`. Node weights are computed
+    here, once: the displacement of a node is linear in the groups' motions, ``u = sum_g W_g t_g + (R_g - I) M_g``.
 
     Args:
         scene: Implant, components and intensity model in their present state.
@@ -76,9 +87,11 @@ class StageModel:
         self._prepare_images(data)
         self.nuisance = Nuisance(scene, config, stage.estimate, self.bin / stage.oversampling)
         if scene.found and stage.screws == "fit":
-            self.screws = ScrewShapes(scene.found, self.screw_path)
-        shapes = self.screws.num_parameters if self.screws else 0
-        self.num_parameters = self.motion.num_parameters + self.nuisance.num_parameters + shapes
+            self.screws = ScrewShapes(scene.found, self.screw_path, scene.tilts)
+        self.tilts = ComponentTilts(scene) if scene.components and stage.tilts else None
+        blocks = (self.motion, self.nuisance, self.screws, self.tilts)
+        self._sizes = [0 if block is None else block.num_parameters for block in blocks]
+        self.num_parameters = sum(self._sizes)
 
     def _prepare_motion(self) -> None:
         grid = self.scene.deformation.grid
@@ -120,7 +133,8 @@ class StageModel:
 
     def _prepare_images(self, data: RegistrationData) -> None:
         stage = self.stage
-        at_start = self.world_points(torch.zeros(1, self.motion.num_parameters, dtype=torch.float64))
+        still = torch.zeros(1, self.motion.num_parameters, dtype=torch.float64)
+        at_start = self._points(self.motion.steps(still), self._tilted_so_far())
         self.bin = min(stage.bin, max(1, int(_COARSEST_PIXEL_MM / data.geometry.pixel_spacing[1])))
         self.data = data.binned(self.bin)
         if stage.margin_mm is not None:
@@ -144,17 +158,16 @@ class StageModel:
         """The candidate (1, D) that leaves the scene as it is."""
         return torch.zeros(1, self.num_parameters, dtype=torch.float64)
 
-    def split(self, parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Parameters (..., D) of the motion, of the intensity model and of the shapes of found screws."""
-        motion, physics = self.motion.num_parameters, self.nuisance.num_parameters
-        return parameters.split([motion, physics, self.num_parameters - motion - physics], dim=-1)
+    def split(self, parameters: Tensor) -> Blocks:
+        """Parameters (..., D), block by block."""
+        return Blocks(*parameters.split(self._sizes, dim=-1))
 
     def clamped(self, parameters: Tensor) -> Tensor:
         """Parameters (K, D), all within their bounds."""
-        motion, physics, shapes = self.split(parameters)
+        motion, physics, shapes, tilts = self.split(parameters)
         if self.screws:
             shapes = self.screws.clamp(shapes)
-        return torch.cat([motion, self.nuisance.clamp(physics), shapes], dim=-1)
+        return torch.cat([motion, self.nuisance.clamp(physics), shapes, tilts], dim=-1)
 
     def motion_steps(self, parameters: Tensor) -> Tensor:
         """Motions (K, 4 G, 3) of the groups in the grid's axes, as the moments multiply them: t_g, then R_g - I."""
@@ -162,17 +175,27 @@ class StageModel:
 
     def world_points(self, parameters: Tensor) -> list[Tensor]:
         """World positions (K, N_m, 3) of the nodes of each material."""
-        steps = self.motion_steps(parameters) @ self.grid_to_world[:3, :3].T
+        tilts = self.tilts.motions(self.split(parameters).tilts) if self.tilts else self._tilted_so_far()
+        return self._points(self.motion_steps(parameters), tilts)
+
+    def _points(self, steps: Tensor, tilts: Tensor) -> list[Tensor]:
+        steps = steps @ self.grid_to_world[:3, :3].T
         motions = [
             fit_rigid(points.double().expand(len(steps), -1, -1), displaced(steps))
             for points, displaced in zip(self.scene.followed, self.followed, strict=True)
         ]
+        motions = [motion @ tilts[:, index] for index, motion in enumerate(motions)]
         clouds = []
         for cloud in self.clouds:
             parts = [self.nodes(steps)] if cloud.holds_implant else []
             parts += [transform_points(motions[i].float(), nodes) for i, nodes in cloud.components]
             clouds.append(torch.cat(parts, dim=1))
         return clouds
+
+    def _tilted_so_far(self) -> Tensor:
+        """Rigid motions (1, C, 4, 4) of the components about their heads, in the implant's frame."""
+        heads = [component.head.double() for component in self.scene.components]
+        return rotation_about(torch.stack(heads), self.scene.tilts)[None] if heads else torch.zeros(1, 0, 4, 4)
 
     def path_lengths(self, parameters: Tensor) -> Tensor:
         """Path lengths (K, M, V, rows, cols) of candidates (K, D) on the oversampled pixels, mm.
@@ -188,7 +211,7 @@ class StageModel:
             )
         ]
         if self.screws:
-            paths[0] = paths[0] + self.screws(self.split(parameters)[2])
+            paths[0] = paths[0] + self.screws(self.split(parameters).shapes)
         if self.scene.is_polyenergetic:
             paths.append(self._unknown(parameters).expand_as(paths[0]))
         return torch.stack(paths, dim=-4)
@@ -197,16 +220,21 @@ class StageModel:
         """Path lengths of the background, which follows the parameters of the intensity model."""
         if self.background is None:
             return torch.zeros(())
-        unknown, steps = self.background, self.split(parameters)[1]
+        unknown, steps = self.background, self.split(parameters).physics
         for name, slope in self.background_slopes.items():
             unknown = unknown + self.nuisance.change(steps, name).to(slope)[:, None, None, None] * slope
         return unknown
 
     @torch.no_grad()
-    def screw_path(self, screw: FoundScrew) -> Tensor:
-        """Path lengths (V, rows, cols) of a screw of the implant's material where the scene has it, mm."""
+    def screw_path(self, screw: FoundScrew, tilt: Tensor | None = None) -> Tensor:
+        """Path lengths (V, rows, cols) in mm of a screw of the implant's material where the scene has it.
+
+        Args:
+            screw: The screw.
+            tilt: Rotation vector (3,) about its start.
+        """
         component = screw.component("screw", self.scene.material, _SCREW_PITCH_MM)
-        motion = self.scene.implant_to_world @ self.scene.motion_of(component)
+        motion = self.scene.implant_to_world @ self.scene.motion_of(component, tilt)
         points = transform_points(motion, component.cloud.points.double()).float()
         cell = component.cloud.cell.float() @ motion[:3, :3].float().T
         footprint = cell_footprint(points, cell, self.matrices)
@@ -215,7 +243,7 @@ class StageModel:
 
     def intensity_options(self, parameters: Tensor) -> dict[str, Tensor]:
         """Keyword arguments of the intensity model for candidates (K, D)."""
-        options = self.nuisance(self.split(parameters)[1])
+        options = self.nuisance(self.split(parameters).physics)
         if self.data.scatter_shape is not None and self.scene.is_polyenergetic:
             options["scatter_shape"] = self.data.scatter_shape
         return options

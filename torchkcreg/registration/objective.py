@@ -40,7 +40,7 @@ class StageObjective:
 
     def control_points(self, parameters: Tensor) -> Tensor:
         """Control-point displacements (K, nx, ny, nz, 3) of candidates."""
-        rotations, translations = self.model.motion(self.model.split(parameters)[0])
+        rotations, translations = self.model.motion(self.model.split(parameters).motion)
         return control_points_from_groups(self.scene.deformation.grid, self.model.labels, rotations, translations)
 
     def penalty(self, parameters: Tensor) -> Tensor:
@@ -51,9 +51,13 @@ class StageObjective:
         in many places: between the screws that load it a plate is free.
         """
         motion = self.model.motion
-        physics = self.config.prior_weight * self.model.nuisance.penalty(self.model.split(parameters)[1])
+        blocks = self.model.split(parameters)
+        unlikely = self.model.nuisance.penalty(blocks.physics)
+        if self.model.tilts:
+            unlikely = unlikely + self.model.tilts.penalty(blocks.tilts)
+        physics = self.config.prior_weight * unlikely
         if isinstance(motion, ModalMotion):
-            loads = self.config.youngs_modulus_gpa * motion.loads(self.model.split(parameters)[0])
+            loads = self.config.youngs_modulus_gpa * motion.loads(blocks.motion)
             return physics + self.config.load_weight * loads.square().sum(-1)
         diffusion = diffusion_penalty(self.control_points(parameters), self.scene.deformation.grid)
         elastic = self.model.elasticity.energy(self.model.motion_steps(parameters))
@@ -122,10 +126,12 @@ class StageObjective:
         deformation.labels.copy_(self.model.labels)
         common = deformation.remove_common_rigid(self.model.weights)
         self.scene.implant_to_world.copy_(self.scene.implant_to_world @ common.double())
-        _, physics, shapes = self.model.split(parameters)
-        self.model.nuisance.accept(physics)
+        blocks = self.model.split(parameters)
+        self.model.nuisance.accept(blocks.physics)
+        tilts = self.model.tilts.vectors(blocks.tilts) if self.model.tilts else self.scene.tilts
         if self.model.screws:
-            self.scene.place(self.model.screws.stepped(shapes), self.config.pitch_mm)
+            self.scene.place(self.model.screws.stepped(blocks.shapes), self.config.pitch_mm)
+        self.scene.tilts = tilts.clone()
 
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:

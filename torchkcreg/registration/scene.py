@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchkcreg.deformation import FreeFormDeformation
-from torchkcreg.geometry import fit_rigid, transform_points
+from torchkcreg.geometry import fit_rigid, rotation_about, transform_points
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
 
 from .found_screw import FoundScrew
@@ -68,19 +68,27 @@ class Scene(nn.Module):
 
     def _set_components(self, components: Sequence[Component]) -> None:
         self.components = list(components)
+        self.tilts = torch.zeros(len(self.components), 3, dtype=torch.float64)
         self.followed = [followed_points(self.implant.points, c.head, self.follow_radius_mm) for c in self.components]
 
     def without_components(self) -> Scene:
         """The implant alone, sharing everything with this scene."""
         bare = copy.copy(self)
-        bare.components, bare.followed, bare.found = [], [], []
+        bare._set_components([])
+        bare.found = []
         return bare
 
     @torch.no_grad()
-    def motion_of(self, component: Component) -> Tensor:
-        """Rigid motion (4, 4) of a component in the implant's frame, whether it is one of the scene's or not."""
+    def motion_of(self, component: Component, tilt: Tensor | None = None) -> Tensor:
+        """Rigid motion (4, 4) of a component in the implant's frame, whether it is one of the scene's or not.
+
+        Args:
+            component: The component.
+            tilt: Rotation vector (3,) about its head, before it follows the implant.
+        """
         points = followed_points(self.implant.points, component.head, self.follow_radius_mm).double()
-        return fit_rigid(points, points + self.deformation.displacement(points))
+        motion = fit_rigid(points, points + self.deformation.displacement(points))
+        return motion if tilt is None else motion @ rotation_about(component.head.double(), tilt)
 
     @property
     def materials(self) -> list[str]:
@@ -102,16 +110,17 @@ class Scene(nn.Module):
         state = self.state_dict()
         return {name: value.clone() for name, value in state.items() if not name.startswith("implant.")}
 
-    def kept(self) -> tuple[dict[str, Tensor], list[FoundScrew]]:
+    def kept(self) -> tuple[dict[str, Tensor], list[FoundScrew], Tensor]:
         """What :meth:`restore` goes back to."""
-        return self.moving_state(), list(self.found)
+        return self.moving_state(), list(self.found), self.tilts.clone()
 
-    def restore(self, kept: tuple[dict[str, Tensor], list[FoundScrew]], pitch: float) -> None:
+    def restore(self, kept: tuple[dict[str, Tensor], list[FoundScrew], Tensor], pitch: float) -> None:
         """Goes back to a state, nodes of found screws ``pitch`` mm apart."""
-        state, found = kept
+        state, found, tilts = kept
         self.load_state_dict(state, strict=False)
         if self.found != found:
             self.place(found, pitch)
+        self.tilts = tilts.clone()
 
     @torch.no_grad()
     def nodes(self, coarsening: int = 8) -> Tensor:
@@ -122,7 +131,7 @@ class Scene(nn.Module):
     @torch.no_grad()
     def component_motions(self) -> dict[str, Tensor]:
         """Rigid motion (4, 4) of each component in the implant's frame."""
-        return {component.name: self.motion_of(component) for component in self.components}
+        return {c.name: self.motion_of(c, tilt) for c, tilt in zip(self.components, self.tilts, strict=True)}
 
 
 def followed_points(points: Tensor, head: Tensor, radius: float, at_most: int = 200) -> Tensor:

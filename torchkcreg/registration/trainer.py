@@ -163,6 +163,7 @@ class Trainer:
             "next_stage": self.next_stage,
             "history": self.history,
             "screws": [asdict(screw) for screw in self.scene.found],
+            "tilts": self.scene.tilts.clone(),
             "undone": self.undone,
             "rival": None if self.rival is None else asdict(self.rival),
         }
@@ -178,7 +179,7 @@ class Trainer:
         if unknown:
             raise ValueError(f"the checkpoint does not fit this registration: {', '.join(unknown)} differ")
         found = [FoundScrew(**screw) for screw in state["screws"]]
-        self.scene.restore((state["scene"], found), self.config.pitch_mm)
+        self.scene.restore((state["scene"], found, state["tilts"]), self.config.pitch_mm)
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])
         self.undone = dict(state["undone"])
         self.rival = None if state["rival"] is None else Rival(**state["rival"])
