@@ -10,6 +10,8 @@ OptimizerName = Literal["gauss-newton", "cmaes", "adam"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
 NuisanceName = Literal["scatter", "blur", "hardness"]
 
+_COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
+
 
 class Stage(BaseModel):
     """One level of the coarse-to-fine schedule.
@@ -62,6 +64,10 @@ class Stage(BaseModel):
     robust: bool = False
     contrast: bool = False
     estimate: tuple[NuisanceName, ...] = ()
+
+    def binning(self, pixel_mm: float) -> int:
+        """How many of a detector's pixels are averaged along each side."""
+        return min(self.bin, max(1, int(_COARSEST_PIXEL_MM / pixel_mm)))
 
     @model_validator(mode="after")
     def _slides_as_one(self) -> Stage:

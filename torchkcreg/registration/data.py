@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -26,8 +26,7 @@ class RegistrationData:
         mask: True where a pixel counts, shape (V, rows, cols); all pixels when None was given.
         background: Path length of what the known components lack (bone, water) through one material that stands for
             it, shape (V, rows, cols), mm; None where nothing is known of it.
-        background_slopes: How the background's estimate changes with parameters of the intensity model, by name, each
-            of shape (V, rows, cols), mm a unit of the parameter.
+        background_mm: Its smoothness, standard deviation in mm at the detector.
         scatter_shape: How scatter is spread over the detector, shape (V, rows, cols); evenly if None.
 
     Raises:
@@ -38,7 +37,7 @@ class RegistrationData:
     line_integrals: Tensor
     mask: Tensor = None  # type: ignore[assignment]  # set below
     background: Tensor | None = None
-    background_slopes: Mapping[str, Tensor] = field(default_factory=dict)
+    background_mm: float = 0.0
     scatter_shape: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -124,6 +123,12 @@ class RegistrationData:
                 cut[view, :height, :width] = image[view, v0 : v0 + height, u0 : u0 + width]
             return cut
 
+        def continued(image: Tensor) -> Tensor:
+            """An estimate goes on beyond the detector, from where the blur of a DRR mixes it in."""
+            v, u = (torch.arange(size) + first for size, first in ((size_v, low[:, 1:]), (size_u, low[:, :1])))
+            views = torch.arange(self.num_views)[:, None, None]
+            return image[views, v.clamp_max(rows - 1)[:, :, None], u.clamp_max(cols - 1)[:, None, :]]
+
         geometry = ConeBeamGeometry(
             matrices,
             (size_v, size_u),
@@ -131,7 +136,7 @@ class RegistrationData:
             sources=self.geometry.sources,
             angles_deg=self.geometry.angles_deg,
         )
-        estimates = self._estimates(window)
+        estimates = self._estimates(continued)
         return RegistrationData(geometry, window(self.line_integrals), window(self.mask), **estimates)
 
     def with_scatter_shape(self, sigma_mm: float) -> RegistrationData:
@@ -154,7 +159,7 @@ class RegistrationData:
         """What is estimated about the images, each image changed."""
         known = {"background": self.background, "scatter_shape": self.scatter_shape}
         changed = {name: None if image is None else change(image) for name, image in known.items()}
-        return {**changed, "background_slopes": {name: change(image) for name, image in self.background_slopes.items()}}
+        return {**changed, "background_mm": self.background_mm}
 
 
 def resized(images: Tensor, det_shape: tuple[int, int]) -> Tensor:

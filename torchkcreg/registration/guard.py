@@ -15,7 +15,8 @@ from .objective import stage_objective
 from .scene import Scene
 
 _PIXEL_MM = 1.5  # nothing finer is needed to see that a stage went astray
-_LOST = 1.25  # times what was unexplained before; robust weights may trade a little
+_LOST = 1.25  # times what was unexplained before: a stage sees other pixels than its judge
+_NEGLIGIBLE = 0.01  # of the images
 _LARGEST_STRAIN = 0.02  # root mean square; metal yields at a tenth of it
 _LARGEST_TURN_DEG = 60.0
 _FURTHEST = 1.5  # lengths of the implant
@@ -47,7 +48,7 @@ class Guard:
         reason = implausible(self.scene, self.first_pose)
         if reason is None:
             now = misfit(self.scene, self.data, self.config, self.bin)
-            if now <= _LOST * self.misfit:
+            if now <= _LOST * self.misfit + _NEGLIGIBLE or (math.isfinite(now) and not math.isfinite(self.misfit)):
                 self.misfit = now
                 return None
             reason = f"it left {100 * now:.1f} % of the images unexplained, {100 * self.misfit:.1f} % before"

@@ -16,6 +16,7 @@ from torchkcreg.projector import cell_footprint, project_points
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData, resized
 from .elasticity import Elasticity, ModalMotion
+from .following import FollowingBackground
 from .found_screw import FoundScrew, ScrewShapes
 from .motion import GroupMotion
 from .nuisance import Nuisance
@@ -23,7 +24,6 @@ from .scene import Scene
 from .tilts import ComponentTilts
 
 _SCREW_PITCH_MM = 0.5
-_COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
 _SOLID_PITCH_FACTOR = 8  # bending is smooth: its energy needs few nodes
 
 
@@ -135,7 +135,7 @@ class StageModel:
         stage = self.stage
         still = torch.zeros(1, self.motion.num_parameters, dtype=torch.float64)
         at_start = self._points(self.motion.steps(still), self._tilted_so_far())
-        self.bin = min(stage.bin, max(1, int(_COARSEST_PIXEL_MM / data.geometry.pixel_spacing[1])))
+        self.bin = stage.binning(data.geometry.pixel_spacing[1])
         self.data = data.binned(self.bin)
         if stage.margin_mm is not None:
             margin_px = stage.margin_mm / self.data.geometry.pixel_spacing[1]
@@ -143,8 +143,12 @@ class StageModel:
         fine = self.data.geometry.refined(stage.oversampling)
         self.matrices, self.det_shape = fine.projection_matrices.float(), fine.det_shape
         behind = self.data.background
-        self.background = None if behind is None else resized(behind, fine.det_shape)
-        self.background_slopes = {n: resized(x, fine.det_shape) for n, x in self.data.background_slopes.items()}
+        self.background, self.following = None, None
+        if behind is not None and self.scene.is_polyenergetic:
+            self.background = resized(behind, fine.det_shape)
+            sigma = self.data.background_mm / self.data.geometry.pixel_spacing[1]
+            measured, shape = self.data.line_integrals, self.data.scatter_shape
+            self.following = FollowingBackground(measured, self.data.mask, shape, sigma)
         cell = self.implant.cell.float() @ self.scene.implant_to_world[:3, :3].float().T
         self.footprints = [cell_footprint(points[0], cell, self.matrices) for points in at_start]
 
@@ -213,17 +217,9 @@ class StageModel:
         if self.screws:
             paths[0] = paths[0] + self.screws(self.split(parameters).shapes)
         if self.scene.is_polyenergetic:
-            paths.append(self._unknown(parameters).expand_as(paths[0]))
+            unknown = torch.zeros(()) if self.background is None else self.background
+            paths.append(unknown.expand_as(paths[0]))
         return torch.stack(paths, dim=-4)
-
-    def _unknown(self, parameters: Tensor) -> Tensor:
-        """Path lengths of the background, which follows the parameters of the intensity model."""
-        if self.background is None:
-            return torch.zeros(())
-        unknown, steps = self.background, self.split(parameters).physics
-        for name, slope in self.background_slopes.items():
-            unknown = unknown + self.nuisance.change(steps, name).to(slope)[:, None, None, None] * slope
-        return unknown
 
     @torch.no_grad()
     def screw_path(self, screw: FoundScrew, tilt: Tensor | None = None) -> Tensor:
@@ -249,9 +245,13 @@ class StageModel:
         return options
 
     def line_integrals(self, parameters: Tensor) -> Tensor:
-        """DRRs (K, V, rows, cols) of candidates (K, D)."""
+        """DRRs (K, V, rows, cols) of candidates (K, D), with the background that goes with each."""
         paths, options = self.path_lengths(parameters), self.intensity_options(parameters)
-        return self.scene.intensity(paths, pooling=self.stage.oversampling, **options)
+        lines = self.scene.intensity(paths, pooling=self.stage.oversampling, **options)
+        if self.following is None:
+            return lines
+        scatter = options.get("scatter", self.scene.intensity.get_parameter("scatter").detach().expand(len(lines)))
+        return self.following(lines, scatter)
 
 
 def _coarsened(cloud: ImplantPointCloud, factor: int) -> ImplantPointCloud:

@@ -14,7 +14,7 @@ from .scene import Scene
 # radiograph about as much as a millimetre of motion, so that one step size suits all parameters.
 _PARAMETERS = {
     "scatter": ("scatter", 0.05, 0.0, 0.9),
-    "blur": ("blur_sigma_px", 0.5, 0.2, 5.0),
+    "blur": ("blur_sigma_px", 0.5, 0.1, 5.0),
     "hardness": ("hardness", 2.0, -5.0, 20.0),
 }
 _LIKELY_SCATTER = 0.2  # about the start: scanners and limbs differ that much

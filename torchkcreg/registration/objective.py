@@ -16,6 +16,7 @@ from .model import StageModel
 from .robust import residual_weights
 from .scene import Scene
 
+_BACKGROUND_PIXELS = 4.0  # a finer background takes over the edges that a stage sees
 _NODES_AT_ONCE = 5_000_000  # of all candidates that are rendered together: 60 MB of positions
 
 
@@ -138,8 +139,9 @@ def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: 
     """The objective of a stage at the scene's present state, with the background that the stage asks for."""
     data = with_scatter_shape(scene, data, config)
     if stage.background and scene.is_polyenergetic:
-        follows = [name for name in stage.estimate if name != "blur"]
-        data = with_background(scene, data, config, follows=follows)
+        pixel = data.geometry.pixel_spacing[1]
+        width = max(config.background_mm, _BACKGROUND_PIXELS * stage.binning(pixel) * pixel)
+        data = with_background(scene, data, config, width)
     return StageObjective(scene, data, stage, config)
 
 
