@@ -184,8 +184,29 @@ def draw_plot(rows: list[dict[str, Any]], path: Path) -> None:
     plt.close(figure)
 
 
+def draw_verdict(rows: list[dict[str, Any]], path: Path) -> None:
+    """Missed failures against idle alarms for every threshold of the expected error of the nodes, taken alone."""
+    rows = [row for row in rows if np.isfinite(row["worst"])]
+    expected = np.array([row["node_std_mm"] for row in rows])
+    worst = np.array([row["worst"] for row in rows])
+    wrong, right = worst > WRONG_MM, worst < RIGHT_MM
+    thresholds = np.linspace(0.01, 0.2, 191)
+    missed = [float((wrong & (expected <= t)).sum()) for t in thresholds]
+    idle = [float((right & (expected > t)).sum()) for t in thresholds]
+    figure, (left, curve) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    left.scatter(expected, worst, s=24, color="#0072B2")
+    left.axhline(WRONG_MM, color="0.8", zorder=0)
+    left.set(xlabel="node_std_mm", ylabel="largest error figure (mm)", xscale="log", yscale="log")
+    curve.step(thresholds, missed, where="post", color="#D55E00", label=f"missed, of {wrong.sum()} above {WRONG_MM} mm")
+    curve.step(thresholds, idle, where="post", color="#0072B2", label=f"idle, of {right.sum()} below {RIGHT_MM} mm")
+    curve.set(xlabel="threshold of node_std_mm (mm)", ylabel="registrations")
+    curve.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
 def main() -> None:
-    """Writes table, summary and plot."""
+    """Writes table, summary and plots."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
@@ -211,6 +232,7 @@ def main() -> None:
         writer.writerows(rows)
     if options.images == "own":
         draw_plot(rows, options.out / f"{name}.png")
+        draw_verdict([row for row in rows if "node_std_mm" in row], options.out / f"{name}-verdict.png")
     print(summary(rows))
 
 

@@ -55,6 +55,18 @@ def test_a_registration_that_is_told_of_no_screw_finds_it_and_its_shape(mesh: tr
     assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.05
 
 
+def test_screws_found_at_the_start_keep_the_first_stage_from_sliding(mesh: trimesh.Trimesh) -> None:
+    start = pose(1.0, 0.5)
+    data = image(scene_of(mesh, start, components=(TRUE.component("true", "steel", 0.5),)), CONFIG)
+    stages = (Stage(bin=2, oversampling=1, slide=True, screws="find", iterations=30),)
+    cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
+    result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
+    assert len(result.screws) == 1
+    points = cloud.points.double()
+    truth = points @ start[:3, :3].T + start[:3, 3]
+    assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.5
+
+
 def test_screws_are_not_looked_for_where_that_is_not_wanted(mesh: trimesh.Trimesh) -> None:
     data = image(scene_of(mesh, components=(TRUE.component("true", "steel", 0.5),)), CONFIG)
     stages = (Stage(bin=2, oversampling=1, iterations=1, screws="find"),)

@@ -96,6 +96,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         population=16,
         margin_mm=25.0,
         slide=True,
+        screws="find",
     )
     physics: tuple[NuisanceName, ...] = ("scatter", "blur", "hardness")
     seen = {"pitch_factor": 2, "background": True, "contrast": True}

@@ -26,6 +26,8 @@ from .scene import Scene
 from .screws import find_screws
 from .verdict import Diagnostics, diagnose, judge
 
+_SCREW_BIN = 8  # a screw is thinner than a coarser pixel
+
 
 class Trainer:
     """Runs the stages of a configuration on a scene and keeps their history.
@@ -113,15 +115,16 @@ class Trainer:
         return None
 
     def _rigid_stages(self, index: int) -> tuple[Stage, ...]:
-        """A stage's own and those that follow it and keep the implant rigid, without a look for places or screws."""
+        """A stage's own and those that follow it and keep the implant rigid, without a look for places."""
         following = itertools.takewhile(lambda s: s.groups == 1 and s.modes is None, self.stages[index + 1 :])
-        bare = {"slide": False, "screws": None}
-        return tuple(stage.model_copy(update=bare) for stage in (self.stages[index], *following))
+        return tuple(stage.model_copy(update={"slide": False}) for stage in (self.stages[index], *following))
 
     def _look_for_screws(self, stage: Stage) -> None:
         if stage.screws != "find" or not self.scene.holes:
             return
-        self.scene.place(find_screws(self.scene, self.data, self.config, bin=stage.bin), self.config.pitch_mm)
+        self.scene.place(
+            find_screws(self.scene, self.data, self.config, bin=min(stage.bin, _SCREW_BIN)), self.config.pitch_mm
+        )
 
     def _result(self) -> RegistrationResult:
         scene = self.scene
