@@ -29,6 +29,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from matplotlib.ticker import NullFormatter  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 from torchkcreg.evaluation import bb_rmse  # noqa: E402
@@ -197,6 +198,8 @@ def draw_verdict(rows: list[dict[str, Any]], path: Path) -> None:
     left.scatter(expected, worst, s=24, color="#0072B2")
     left.axhline(WRONG_MM, color="0.8", zorder=0)
     left.set(xlabel="node_std_mm", ylabel="largest error figure (mm)", xscale="log", yscale="log")
+    left.xaxis.set_minor_formatter(NullFormatter())
+    left.set_xticks([0.02, 0.05, 0.1, 0.2], ["0.02", "0.05", "0.1", "0.2"])
     curve.step(thresholds, missed, where="post", color="#D55E00", label=f"missed, of {wrong.sum()} above {WRONG_MM} mm")
     curve.step(thresholds, idle, where="post", color="#0072B2", label=f"idle, of {right.sum()} below {RIGHT_MM} mm")
     curve.set(xlabel="threshold of node_std_mm (mm)", ylabel="registrations")

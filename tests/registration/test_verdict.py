@@ -93,3 +93,11 @@ def test_a_parameter_that_ends_at_its_bound_is_named() -> None:
     with torch.no_grad():
         here.intensity.get_parameter("scatter").fill_(0.9)
     assert Nuisance(here, physical, ("scatter", "blur"), 1.0).at_bounds(0.01) == ["scatter"]
+
+
+def test_screws_that_were_found_ask_for_more() -> None:
+    same = replace(GOOD, node_std_mm=0.05)
+    assert judge(same)[0] == "ok"
+    status, (reason,) = judge(replace(same, screws_found=4))
+    assert status == "doubtful"
+    assert "4 screws that were found" in reason

@@ -115,9 +115,11 @@ class Trainer:
         return None
 
     def _rigid_stages(self, index: int) -> tuple[Stage, ...]:
-        """A stage's own and those that follow it and keep the implant rigid, without a look for places."""
+        """A stage's own and those that follow it and keep the implant rigid; one look for screws, none for places."""
         following = itertools.takewhile(lambda s: s.groups == 1 and s.modes is None, self.stages[index + 1 :])
-        return tuple(stage.model_copy(update={"slide": False}) for stage in (self.stages[index], *following))
+        first, *others = [s.model_copy(update={"slide": False}) for s in (self.stages[index], *following)]
+        bare = {"screws": None}
+        return (first.model_copy(update=bare), *others[:1], *(s.model_copy(update=bare) for s in others[1:]))
 
     def _look_for_screws(self, stage: Stage) -> None:
         if stage.screws != "find" or not self.scene.holes:

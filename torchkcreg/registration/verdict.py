@@ -20,6 +20,7 @@ Status = Literal["ok", "doubtful", "failed"]
 _UNRELATED, _WEAK = 0.3, 0.6  # gradient correlation
 _NOTHING, _UNEXPLAINED = 0.2, 0.08  # misfit
 _DEVIATION_MM, _ANYWHERE_MM = 0.065, 0.4
+_DEVIATION_FOUND_MM = 0.045  # with screws that nobody told of: their metal and shape may be others
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.0035  # root mean square strain
 _APART_MM, _ALIKE = 2.0, 1.2  # another place, and how much more it leaves unexplained
@@ -41,6 +42,7 @@ class Diagnostics:
         at_bounds: Parameters of the intensity model that ended at a bound.
         undone: Number of each stage that was undone, from 1 on, and why.
         rival: Where the implant fitted second best, if several places were tried.
+        screws_found: How many screws were found that nobody told of.
     """
 
     gc: list[float]
@@ -53,6 +55,7 @@ class Diagnostics:
     at_bounds: list[str] = field(default_factory=list)
     undone: dict[str, str] = field(default_factory=dict)
     rival: Rival | None = None
+    screws_found: int = 0
 
 
 def judge(found: Diagnostics) -> tuple[Status, list[str]]:
@@ -88,10 +91,13 @@ def _doubts(found: Diagnostics) -> list[str]:
         reasons.append(f"the images agree weakly: gradient correlation is {min(found.gc):.2f}, less than {_WEAK:g}")
     if found.misfit > _UNEXPLAINED:
         reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained")
-    if not found.node_std_mm <= _DEVIATION_MM:
+    limit = _DEVIATION_FOUND_MM if found.screws_found else _DEVIATION_MM
+    if not found.node_std_mm <= limit:
+        help_by = "their list, or views" if found.screws_found else "views"
+        told = f" with {found.screws_found} screws that were found, not given" if found.screws_found else ""
         reasons.append(
-            f"the implant's nodes are expected to be off by {found.node_std_mm:.2f} mm (RMS), more than "
-            f"{_DEVIATION_MM:g} mm: views from other sides would help"
+            f"the implant's nodes are expected to be off by {found.node_std_mm:.3f} mm (RMS), more than "
+            f"{limit:g} mm{told}: {help_by} from other sides would help"
         )
     hardly = [str(view) for view, share in enumerate(found.seen) if share < _HARDLY_SEEN]
     if hardly and max(found.seen) >= _SEEN:
@@ -155,4 +161,5 @@ def diagnose(
         at_bounds=objective.model.nuisance.at_bounds(_AT_BOUND),
         undone=dict(undone),
         rival=rival,
+        screws_found=len(scene.found),
     )
