@@ -64,7 +64,6 @@ def image(of: Scene, config: RegistrationConfig, background: Tensor | None = Non
     blank = RegistrationData(views, torch.zeros(views.num_views, *views.det_shape), background=background)
     stage = Stage(groups=min(3, config.schedule()[-1].groups), margin_mm=None, oversampling=2)
     model = StageModel(of, blank, stage, config)
-    model.following = None  # the background is the true one
     with torch.no_grad():
         lines = model.line_integrals(torch.zeros(1, model.num_parameters, dtype=torch.float64))[0]
     return RegistrationData(views, lines)

@@ -18,7 +18,7 @@ KINDS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_hard_kind_of_case_is_right_or_said_not_to_be(kind: str) -> None:
+def test_a_hard_kind_of_case_is_right(kind: str) -> None:
     case = random_case(replace(draw_case(9), heads=False, scanner="extremity", **KINDS[kind]))
     config = RegistrationConfig(material=case.implant_material)
     data, cloud, screws = registration_inputs(case, config.pitch_mm)

@@ -11,7 +11,7 @@ from statistics import fmean, median
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
+from torchkcreg.geometry import fit_rigid, rotation_about, transform_points
 from torchkcreg.implant import Component, ImplantPointCloud
 from torchkcreg.physics import line_integrals_from_intensity
 from torchkcreg.registration import RegistrationConfig, RegistrationData, RegistrationResult, Stage, register
@@ -203,8 +203,8 @@ def registration_inputs(
 def random_pose(pose: Tensor, offset: float, center: Tensor, generator: torch.Generator) -> Tensor:
     """A pose (4, 4) off by ``offset`` mm and ``offset`` degrees about ``center`` (3,) of the implant's frame."""
     turn, shift = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
-    motion = rigid_matrix(turn * math.radians(offset), offset * shift)
-    motion[:3, 3] += center - motion[:3, :3] @ center
+    motion = rotation_about(center, turn * math.radians(offset))
+    motion[:3, 3] += offset * shift
     return pose @ motion
 
 

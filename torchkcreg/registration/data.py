@@ -26,7 +26,8 @@ class RegistrationData:
         mask: True where a pixel counts, shape (V, rows, cols); all pixels when None was given.
         background: Path length of what the known components lack (bone, water) through one material that stands for
             it, shape (V, rows, cols), mm; None where nothing is known of it.
-        background_mm: Its smoothness, standard deviation in mm at the detector.
+        background_mm: Smoothness of an estimated background, standard deviation in mm at the detector; it then follows
+            each candidate. 0 where the background is known.
         scatter_shape: How scatter is spread over the detector, shape (V, rows, cols); evenly if None.
 
     Raises:

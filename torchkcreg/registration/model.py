@@ -134,7 +134,8 @@ class StageModel:
     def _prepare_images(self, data: RegistrationData) -> None:
         stage = self.stage
         still = torch.zeros(1, self.motion.num_parameters, dtype=torch.float64)
-        at_start = self._points(self.motion.steps(still), self._tilted_so_far())
+        self._tilts_so_far = rotation_about(self.scene.heads, self.scene.tilts)[None]
+        at_start = self._points(self.motion.steps(still), self._tilts_so_far)
         self.bin = stage.binning(data.geometry.pixel_spacing[1])
         self.data = data.binned(self.bin)
         if stage.margin_mm is not None:
@@ -146,6 +147,7 @@ class StageModel:
         self.background, self.following = None, None
         if behind is not None and self.scene.is_polyenergetic:
             self.background = resized(behind, fine.det_shape)
+        if self.background is not None and self.data.background_mm > 0:
             sigma = self.data.background_mm / self.data.geometry.pixel_spacing[1]
             measured, shape = self.data.line_integrals, self.data.scatter_shape
             self.following = FollowingBackground(measured, self.data.mask, shape, sigma)
@@ -179,7 +181,7 @@ class StageModel:
 
     def world_points(self, parameters: Tensor) -> list[Tensor]:
         """World positions (K, N_m, 3) of the nodes of each material."""
-        tilts = self.tilts.motions(self.split(parameters).tilts) if self.tilts else self._tilted_so_far()
+        tilts = self.tilts.motions(self.split(parameters).tilts) if self.tilts else self._tilts_so_far
         return self._points(self.motion_steps(parameters), tilts)
 
     def _points(self, steps: Tensor, tilts: Tensor) -> list[Tensor]:
@@ -195,11 +197,6 @@ class StageModel:
             parts += [transform_points(motions[i].float(), nodes) for i, nodes in cloud.components]
             clouds.append(torch.cat(parts, dim=1))
         return clouds
-
-    def _tilted_so_far(self) -> Tensor:
-        """Rigid motions (1, C, 4, 4) of the components about their heads, in the implant's frame."""
-        heads = [component.head.double() for component in self.scene.components]
-        return rotation_about(torch.stack(heads), self.scene.tilts)[None] if heads else torch.zeros(1, 0, 4, 4)
 
     def path_lengths(self, parameters: Tensor) -> Tensor:
         """Path lengths (K, M, V, rows, cols) of candidates (K, D) on the oversampled pixels, mm.

@@ -74,11 +74,6 @@ class Nuisance:
         """Values (K, D) of the parameters after steps."""
         return self.start + self.scale * steps
 
-    def change(self, steps: Tensor, name: str) -> Tensor:
-        """Change (K,) of a parameter that is estimated."""
-        index = self.names.index(name)
-        return self.scale[index] * steps[..., index]
-
     def __call__(self, steps: Tensor) -> dict[str, Tensor]:
         """Keyword arguments of the intensity model, each of shape (K,); the blur in the images' own pixels."""
         values = dict(zip(self.attributes, self.values(steps).unbind(-1), strict=True))

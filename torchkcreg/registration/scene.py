@@ -68,7 +68,8 @@ class Scene(nn.Module):
 
     def _set_components(self, components: Sequence[Component]) -> None:
         self.components = list(components)
-        self.tilts = torch.zeros(len(self.components), 3, dtype=torch.float64)
+        self.heads = torch.tensor([c.head.tolist() for c in components], dtype=torch.float64).reshape(-1, 3)
+        self.tilts = torch.zeros_like(self.heads)
         self.followed = [followed_points(self.implant.points, c.head, self.follow_radius_mm) for c in self.components]
 
     def without_components(self) -> Scene:

@@ -29,7 +29,6 @@ class ComponentTilts:
     def __init__(self, scene: Scene) -> None:
         self.scene, components = scene, scene.components
         axes = [c.axis.double() for c in components]
-        self.heads = torch.stack([c.head.double() for c in components])
         self.lengths = torch.stack(
             [((c.cloud.points.double() - c.head) @ axis).amax() for c, axis in zip(components, axes, strict=True)]
         ).clamp_min(1.0)
@@ -39,7 +38,7 @@ class ComponentTilts:
     @property
     def num_parameters(self) -> int:
         """Two a component."""
-        return 2 * len(self.heads)
+        return 2 * len(self.lengths)
 
     def vectors(self, parameters: Tensor) -> Tensor:
         """Rotation vectors (K, C, 3) in the implant's frame after steps (K, 2 C), mm at the far ends."""
@@ -48,7 +47,7 @@ class ComponentTilts:
 
     def motions(self, parameters: Tensor) -> Tensor:
         """Rigid motions (K, C, 4, 4) in the implant's frame."""
-        return rotation_about(self.heads, self.vectors(parameters))
+        return rotation_about(self.scene.heads, self.vectors(parameters))
 
     def penalty(self, parameters: Tensor) -> Tensor:
         """Squared tilts (K,) in standard deviations, summed."""

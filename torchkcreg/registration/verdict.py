@@ -91,10 +91,11 @@ def _doubts(found: Diagnostics) -> list[str]:
         reasons.append(f"the images agree weakly: gradient correlation is {min(found.gc):.2f}, less than {_WEAK:g}")
     if found.misfit > _UNEXPLAINED:
         reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained")
-    limit = _DEVIATION_FOUND_MM if found.screws_found else _DEVIATION_MM
+    limit, told, help_by = _DEVIATION_MM, "", "views"
+    if found.screws_found:
+        limit, help_by = _DEVIATION_FOUND_MM, "their list, or views"
+        told = f" with {found.screws_found} screws that were found, not given"
     if not found.node_std_mm <= limit:
-        help_by = "their list, or views" if found.screws_found else "views"
-        told = f" with {found.screws_found} screws that were found, not given" if found.screws_found else ""
         reasons.append(
             f"the implant's nodes are expected to be off by {found.node_std_mm:.3f} mm (RMS), more than "
             f"{limit:g} mm{told}: {help_by} from other sides would help"
