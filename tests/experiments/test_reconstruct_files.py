@@ -116,7 +116,7 @@ def test_screws_that_a_registration_found_are_known_components(small_case, tmp_p
     for screw, found in zip(screws, result.screws, strict=True):
         ends = torch.tensor([found["start"], found["end"]])
         volume = torch.pi * found["radius"] ** 2 * (ends[1] - ends[0]).norm()
-        assert screw.material == plate.material
+        assert screw.material == found["material"]
         assert screw.cloud.volume == pytest.approx(float(volume), rel=0.03)
     told = registered_components(tmp_path / "run", components=small_case / "screws.json")
     assert len(told) == 7

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from torchkcreg.implant import find_holes
 from torchkcreg.simulation.hardware import hole_positions, locking_plate
+from torchkcreg.simulation.loads import RodMotion
 
 
 def test_the_holes_of_a_locking_plate_are_found_in_their_order() -> None:
@@ -58,3 +60,17 @@ def test_solids_pins_and_wide_bores_are_no_screw_holes() -> None:
     assert find_holes(trimesh.creation.box((10, 10, 40))) == []
     assert find_holes(trimesh.creation.cylinder(2.0, 30.0)) == []
     assert find_holes(trimesh.creation.annulus(r_min=9.0, r_max=12.0, height=30.0)) == []
+
+
+@pytest.mark.parametrize(("hole_offset", "expected"), [(0.0, 8), (1.2, 16), (1.8, 16)])
+@pytest.mark.parametrize("flare", [0.0, 0.3])
+def test_a_bent_and_twisted_plate_has_as_many_holes_as_a_straight_one(
+    hole_offset: float, expected: int, flare: float
+) -> None:
+    length = 136.0
+    plate = locking_plate(length=length, num_holes=8, hole_offset=hole_offset)
+    wider = 1 + flare * (plate.vertices[:, 2] / length + 0.5)
+    straight = plate.vertices * np.column_stack([wider, np.ones((len(wider), 2))])
+    bend = RodMotion(lambda z: torch.tensor([0.09, 0.0, 0.07]).double().expand(len(z), 3) / length, (-70.0, 70.0))
+    bent = trimesh.Trimesh(bend(torch.from_numpy(straight)).numpy(), plate.faces, process=False)
+    assert len(find_holes(bent)) == expected

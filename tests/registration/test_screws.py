@@ -1,5 +1,7 @@
 """Screws that are found in an implant's holes, and their shapes that are estimated along."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from torchkcreg.registration import RegistrationConfig, Stage, build_scene, find
 from torchkcreg.registration.found_screw import FoundScrew, ScrewShapes
 from torchkcreg.registration.model import StageModel
 
-TRUE = FoundScrew((0.0, 1.5, 15.0), (0.0, -18.0, 15.0), 1.6)
+TRUE = FoundScrew((0.0, 1.5, 15.0), (0.0, -18.0, 15.0), 1.6, "steel")
 CONFIG = RegistrationConfig(material="steel", stages=(Stage(oversampling=1),), **GRID_OF_SCREWS)
 
 
@@ -27,12 +29,43 @@ def scene_of(mesh: trimesh.Trimesh, motion: torch.Tensor | None = None, componen
 
 
 def test_the_one_screw_of_three_holes_is_found_with_its_length_and_radius(mesh: trimesh.Trimesh) -> None:
-    screw = TRUE.component("true", "steel", 0.5)
+    screw = TRUE.component("true", 0.5)
     data = image(scene_of(mesh, components=(screw,)), CONFIG)
     (found,) = find_screws(scene_of(mesh), data, CONFIG, bin=1)
     assert np.allclose(found.start, TRUE.start, atol=0.3)
     assert np.allclose(found.end, TRUE.end, atol=1.0)
     assert found.radius == pytest.approx(TRUE.radius, abs=0.15)
+
+
+@pytest.mark.parametrize("metal", ["steel", "titanium"])
+def test_a_screw_of_either_metal_is_told_by_how_dark_it_is(mesh: trimesh.Trimesh, metal: str) -> None:
+    screw = replace(TRUE, material=metal)
+    data = image(scene_of(mesh, components=(screw.component("true", 0.5),)), CONFIG)
+    (found,) = find_screws(scene_of(mesh), data, CONFIG, bin=1)
+    assert found.material == metal
+    assert np.allclose(found.end, TRUE.end, atol=1.0)
+
+
+def test_a_tilted_screw_of_another_metal_does_not_pull_the_implant_along(mesh: trimesh.Trimesh) -> None:
+    motion = pose(0.4, 0.3)
+    tilted = replace(TRUE, material="titanium").tilted(torch.tensor([0.0, 0.0, 0.1]))
+    data = image(scene_of(mesh, motion, components=(tilted.component("true", 0.5),)), CONFIG)
+    fit = {"oversampling": 1, "tilts": True, "tolerance": 1e-4, "iterations": 40}
+    stages = (Stage(bin=2, screws="find", **fit), Stage(bin=2, screws="find", **fit), Stage(screws="fit", **fit))
+    cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
+    result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
+    (found,) = result.screws
+    assert found["material"] == "titanium"
+    assert np.allclose(found["end"], tilted.end, atol=0.3)
+    points = cloud.points.double()
+    truth = points @ motion[:3, :3].T + motion[:3, 3]
+    assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.05
+
+
+def test_a_screw_moves_to_the_other_part_of_a_combination_hole_and_keeps_its_tip(mesh: trimesh.Trimesh) -> None:
+    moved = TRUE.shifted_to((0.0, 1.5, 17.0))
+    assert moved.end == pytest.approx((0.0, -18.0, 17.0)) and moved.length == pytest.approx(TRUE.length)
+    assert TRUE.same_side(moved) and not TRUE.same_side(replace(TRUE, end=(0.0, 20.0, 15.0)))
 
 
 def test_no_screw_is_found_where_there_is_none(mesh: trimesh.Trimesh) -> None:
@@ -44,7 +77,7 @@ def test_no_screw_is_found_where_there_is_none(mesh: trimesh.Trimesh) -> None:
 
 def test_a_registration_that_is_told_of_no_screw_finds_it_and_its_shape(mesh: trimesh.Trimesh) -> None:
     motion = pose(0.4, 0.3)
-    data = image(scene_of(mesh, motion, components=(TRUE.component("true", "steel", 0.5),)), CONFIG)
+    data = image(scene_of(mesh, motion, components=(TRUE.component("true", 0.5),)), CONFIG)
     stages = (Stage(bin=2, oversampling=1, screws="find"), Stage(oversampling=1, screws="fit", tolerance=1e-4))
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
@@ -57,7 +90,7 @@ def test_a_registration_that_is_told_of_no_screw_finds_it_and_its_shape(mesh: tr
 
 def test_screws_found_at_the_start_keep_the_first_stage_from_sliding(mesh: trimesh.Trimesh) -> None:
     start = pose(1.0, 0.5)
-    data = image(scene_of(mesh, start, components=(TRUE.component("true", "steel", 0.5),)), CONFIG)
+    data = image(scene_of(mesh, start, components=(TRUE.component("true", 0.5),)), CONFIG)
     stages = (Stage(bin=2, oversampling=1, slide=True, screws="find", iterations=30),)
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
@@ -68,7 +101,7 @@ def test_screws_found_at_the_start_keep_the_first_stage_from_sliding(mesh: trime
 
 
 def test_screws_are_not_looked_for_where_that_is_not_wanted(mesh: trimesh.Trimesh) -> None:
-    data = image(scene_of(mesh, components=(TRUE.component("true", "steel", 0.5),)), CONFIG)
+    data = image(scene_of(mesh, components=(TRUE.component("true", 0.5),)), CONFIG)
     stages = (Stage(bin=2, oversampling=1, iterations=1, screws="find"),)
     config = CONFIG.model_copy(update={"stages": stages, "find_screws": False})
     result = register(ImplantPointCloud.from_mesh(mesh, 0.5), data, config, holes=find_holes(mesh))
@@ -77,13 +110,13 @@ def test_screws_are_not_looked_for_where_that_is_not_wanted(mesh: trimesh.Trimes
 
 def test_shapes_are_the_slopes_of_the_images(mesh: trimesh.Trimesh) -> None:
     model = StageModel(scene_of(mesh), image(scene_of(mesh), CONFIG), CONFIG.stages[0], CONFIG)
-    shapes = ScrewShapes([TRUE], model.screw_path, torch.zeros(1, 3, dtype=torch.float64))
-    longer = shapes(torch.tensor([[0.4, 0.0]], dtype=torch.float64))[0]
+    shapes = ScrewShapes([TRUE], model.screw_path)
+    longer = shapes(torch.tensor([[0.4, 0.0]], dtype=torch.float64))["steel"][0]
     (stepped,) = shapes.stepped(torch.tensor([0.4, 0.0], dtype=torch.float64))
     assert stepped.length == pytest.approx(TRUE.length + 0.4)
     change = model.screw_path(stepped) - model.screw_path(TRUE)
     assert float(longer.sum()) == pytest.approx(float(change.sum()), rel=0.03)
-    thicker = shapes(torch.tensor([[0.0, 0.5]], dtype=torch.float64))[0]
+    thicker = shapes(torch.tensor([[0.0, 0.5]], dtype=torch.float64))["steel"][0]
     (stepped,) = shapes.stepped(torch.tensor([0.0, 0.5], dtype=torch.float64))
     assert stepped.radius == pytest.approx(TRUE.radius + 0.1)
     change = model.screw_path(stepped) - model.screw_path(TRUE)
@@ -91,6 +124,6 @@ def test_shapes_are_the_slopes_of_the_images(mesh: trimesh.Trimesh) -> None:
 
 
 def test_screws_side_by_side_overlap_and_others_do_not() -> None:
-    beside = FoundScrew((0.0, 1.5, 18.0), (0.0, -18.0, 18.0), 1.6)
-    apart = FoundScrew((0.0, 1.5, 19.0), (0.0, -18.0, 19.0), 1.6)
+    beside = FoundScrew((0.0, 1.5, 18.0), (0.0, -18.0, 18.0), 1.6, "steel")
+    apart = FoundScrew((0.0, 1.5, 19.0), (0.0, -18.0, 19.0), 1.6, "steel")
     assert TRUE.overlaps(TRUE.with_length(5.0)) and TRUE.overlaps(beside) and not TRUE.overlaps(apart)

@@ -40,15 +40,15 @@ def registered_components(
     mesh = read_mesh(files["implant"])
     known = [KnownComponent.from_mesh(deformed_surface(result, mesh, longest_edge_mm=2.0), name, pitch=pitch)]
     path = components or (Path(files["components"]) if files.get("components") else None)
-    specs = read_components(path) if path is not None else _found_screws(result, name)
+    specs = read_components(path) if path is not None else _found_screws(result)
     screws = [KnownComponent.from_mesh(_placed_screw(s, mesh, result), s.material, pitch=pitch) for s in specs]
     return [*known, *screws]
 
 
-def _found_screws(result: RegistrationResult, material: str) -> list[ComponentSpec]:
-    """The screws that a registration found, of the implant's material, under the names their motions are kept by."""
+def _found_screws(result: RegistrationResult) -> list[ComponentSpec]:
+    """The screws that a registration found, under the names their motions are kept by."""
     return [
-        ComponentSpec(tuple(s["start"]), tuple(s["end"]), s["radius"], material, f"found{i}")
+        ComponentSpec(tuple(s["start"]), tuple(s["end"]), s["radius"], s["material"], f"found{i}")
         for i, s in enumerate(result.screws)
     ]
 

@@ -8,6 +8,7 @@ from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
 from torchkcreg.geometry.multisource import MultisourceScanner
 from torchkcreg.geometry.se3 import (
+    across,
     fit_rigid,
     invert_rigid,
     rigid_matrix,
@@ -22,6 +23,7 @@ __all__ = [
     "ConeBeamGeometry",
     "MultisourceScanner",
     "VolumeGrid",
+    "across",
     "circular_geometry",
     "fit_rigid",
     "invert_rigid",

@@ -106,6 +106,18 @@ def rotation_about(center: Tensor, rotation_vector: Tensor) -> Tensor:
     return _assemble(turn, center - (turn @ center[..., None])[..., 0])
 
 
+def across(axis: Tensor) -> Tensor:
+    """Two unit vectors (2, 3) that make a right-handed frame with a unit vector (3,), which comes last.
+
+    >>> across(torch.tensor([0.0, 0.0, 1.0])).abs().tolist()
+    [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    """
+    other = torch.eye(3).to(axis)[int(axis.abs().argmin())]
+    first = torch.linalg.cross(axis, other)
+    first = first / first.norm()
+    return torch.stack([first, torch.linalg.cross(axis, first)])
+
+
 def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
     """Points (..., N, 3) moved by affine transforms (..., 4, 4), leading dimensions broadcast; in the points' dtype.
 

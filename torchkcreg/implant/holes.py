@@ -9,8 +9,9 @@ import numpy as np
 import trimesh
 
 _STEEPEST_TURN = np.deg2rad(50.0)  # between neighbouring faces of a hole's wall
+_FLAT = np.deg2rad(3.0)  # in a bent implant the triangles of a wall's facet are no longer in one plane
 _ALONG_AXIS = 0.35  # a wall's normals are at right angles to its axis, but for countersinks
-_OPENING = np.deg2rad(150.0)  # a wall surrounds its screw by more than half: combination holes open into each other
+_OPENING = np.deg2rad(170.0)  # a wall surrounds its screw by more than half: combination holes open into each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ def find_holes(mesh: trimesh.Trimesh, *, smallest_mm: float = 0.75, largest_mm: 
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     turn = merged.face_adjacency_angles
     inwards = ~merged.face_adjacency_convex & (turn > 1e-6) & (turn < _STEEPEST_TURN)
-    flat = turn <= 1e-6
+    flat = turn < _FLAT
     graph = networkx.Graph(merged.face_adjacency[inwards].tolist())
     curved = np.zeros(len(merged.faces), bool)
     curved[list(graph.nodes)] = True

@@ -101,9 +101,9 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
     physics: tuple[NuisanceName, ...] = ("scatter", "blur", "hardness")
     seen = {"pitch_factor": 2, "background": True, "contrast": True}
     levels = [
-        Stage(bin=8, pitch_factor=4, screws="find"),
-        Stage(bin=4, screws="find", estimate=("scatter", "hardness"), **seen),
-        Stage(groups=2, bin=4, screws="find", estimate=physics, **seen),
+        Stage(bin=8, pitch_factor=4, screws="find", tilts=True),
+        Stage(bin=4, screws="find", tilts=True, estimate=("scatter", "hardness"), **seen),
+        Stage(groups=2, bin=4, screws="find", tilts=True, estimate=physics, **seen),
         Stage(groups=2, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
         Stage(groups=20, modes=40, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
         Stage(groups=20, modes=40, bin=1, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
@@ -151,6 +151,7 @@ class RegistrationConfig(BaseModel):
         background_mm: Smoothness of the estimated background, standard deviation in mm at the detector.
         background_material: What the background is made of, as far as it hardens the beam.
         find_screws: Whether screws are looked for in the implant's holes where no components are given.
+        screw_materials: What they may be made of, besides the implant's own material.
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp", "triton" or "torch".
@@ -175,6 +176,7 @@ class RegistrationConfig(BaseModel):
     background_mm: float = Field(2.5, gt=0)
     background_material: str = "soft_tissue"
     find_screws: bool = True
+    screw_materials: tuple[str, ...] = ("steel", "titanium")
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
     backend: Literal["auto", "cpp", "triton", "torch"] = "auto"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,11 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchkcreg.implant import Component
+from torchkcreg.geometry import across, rotation_about, transform_points
+from torchkcreg.implant import Component, ImplantPointCloud, cylinder_cloud
 
 _LENGTH_STEP_MM = 0.5
 _RADIUS_STEP_MM = 0.05
 _RADIUS_UNIT_MM = 0.2  # a unit step in radius changes an image about as much as one in length
+_COMMON_LENGTH_MM, _COMMON_RADIUS_MM = 24.0, 2.0  # about those of most screws
 _LARGEST_STEPS_MM = (4.0, 0.4)  # of length and radius in one stage
 
 
@@ -25,11 +28,13 @@ class FoundScrew:
         start: Centre (x, y, z) of its head's end, in the hole's opening.
         end: Its tip.
         radius: Of its shaft.
+        material: Name of its material.
     """
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
     radius: float
+    material: str
 
     @property
     def length(self) -> float:
@@ -46,15 +51,47 @@ class FoundScrew:
         """The screw, thicker or thinner."""
         return replace(self, radius=radius)
 
+    def shifted_to(self, start: tuple[float, float, float]) -> FoundScrew:
+        """The screw, moved as a whole."""
+        x, y, z = (np.array(self.end) + start - self.start).tolist()
+        return replace(self, start=start, end=(x, y, z))
+
+    def same_side(self, other: FoundScrew) -> bool:
+        """Whether two screws point the same way."""
+        return float(np.subtract(self.end, self.start) @ np.subtract(other.end, other.start)) > 0
+
     def overlaps(self, other: FoundScrew) -> bool:
         """Whether two screws share a hole or, side by side in a combination hole, run into each other."""
         way = np.subtract(self.start, other.start)
         axis = np.subtract(other.end, other.start) / other.length
         return float(np.linalg.norm(way - (way @ axis) * axis)) < self.radius + other.radius
 
-    def component(self, name: str, material: str, pitch: float) -> Component:
+    def tilted(self, rotation: Tensor) -> FoundScrew:
+        """The screw, turned about its start by a rotation vector (3,)."""
+        start = torch.tensor([self.start], dtype=torch.float64)
+        turn = rotation_about(start, rotation.double()[None])[0]
+        x, y, z = transform_points(turn, torch.tensor([self.end], dtype=torch.float64))[0].tolist()
+        return replace(self, end=(x, y, z))
+
+    def cloud(self, pitch: float) -> ImplantPointCloud:
+        """Nodes of the screw, those of a common one stretched: in no time, but on a lattice of its own."""
+        common = _common_cloud(pitch)
+        start, end = (torch.tensor(p, dtype=torch.float64) for p in (self.start, self.end))
+        axis = (end - start) / (end - start).norm()
+        thicker, longer = self.radius / _COMMON_RADIUS_MM, self.length / _COMMON_LENGTH_MM
+        stretch = torch.tensor([[thicker], [thicker], [longer]]) * torch.cat([across(axis), axis[None]])
+        masses = common.masses * (thicker**2 * longer)
+        return ImplantPointCloud(start + common.points @ stretch, masses, common.cell @ stretch)
+
+    def component(self, name: str, pitch: float) -> Component:
         """The screw's nodes, ``pitch`` mm apart."""
-        return Component.screw(name, self.start, self.end, self.radius, material=material, pitch=pitch)
+        return Component.screw(name, self.start, self.end, self.radius, material=self.material, pitch=pitch)
+
+
+@functools.cache
+def _common_cloud(pitch: float) -> ImplantPointCloud:
+    tip = (0.0, 0.0, _COMMON_LENGTH_MM)
+    return cylinder_cloud((0.0, 0.0, 0.0), tip, _COMMON_RADIUS_MM, pitch, dtype=torch.float64)
 
 
 class ScrewShapes:
@@ -62,31 +99,29 @@ class ScrewShapes:
 
     Args:
         screws: The screws.
-        render: Path lengths (..., V, rows, cols) of a screw where it now is, tilted by a rotation vector (3,).
-        tilts: The screws' tilts, shape (n, 3).
+        render: Path lengths (V, rows, cols) of a screw where it now is.
     """
 
-    def __init__(
-        self, screws: Sequence[FoundScrew], render: Callable[[FoundScrew, Tensor], Tensor], tilts: Tensor
-    ) -> None:
+    def __init__(self, screws: Sequence[FoundScrew], render: Callable[[FoundScrew], Tensor]) -> None:
         self.screws = list(screws)
-        tilted = list(zip(self.screws, tilts, strict=True))
         longer, thicker = _LENGTH_STEP_MM, _RADIUS_STEP_MM
-        slopes = [
-            (render(s.with_length(s.length + longer), t) - render(s.with_length(s.length - longer), t)) / (2 * longer)
-            for s, t in tilted
+        lengths = [
+            (render(s.with_length(s.length + longer)) - render(s.with_length(s.length - longer))) / (2 * longer)
+            for s in self.screws
         ]
         swelling = [
-            render(s.with_radius(s.radius + thicker), t) - render(s.with_radius(s.radius - thicker), t)
-            for s, t in tilted
+            render(s.with_radius(s.radius + thicker)) - render(s.with_radius(s.radius - thicker)) for s in self.screws
         ]
-        slopes.append(torch.stack(swelling).sum(0) * (_RADIUS_UNIT_MM / (2 * thicker)))
-        self.slopes = torch.stack(slopes)
+        self.slopes = {}
+        for material in dict.fromkeys(s.material for s in self.screws):
+            own = torch.tensor([float(s.material == material) for s in self.screws])
+            thickness = torch.tensordot(own, torch.stack(swelling), dims=1) * (_RADIUS_UNIT_MM / (2 * thicker))
+            self.slopes[material] = torch.cat([own[:, None, None, None] * torch.stack(lengths), thickness[None]])
 
     @property
     def num_parameters(self) -> int:
         """One length a screw, and one radius."""
-        return len(self.slopes)
+        return len(self.screws) + 1
 
     def clamp(self, steps: Tensor) -> Tensor:
         """Steps (K, S) within what the linear images hold for."""
@@ -95,9 +130,9 @@ class ScrewShapes:
         limit[..., -1] = radius / _RADIUS_UNIT_MM
         return torch.minimum(torch.maximum(steps, -limit), limit)
 
-    def __call__(self, steps: Tensor) -> Tensor:
-        """What steps (K, S) add to the path lengths, shape (K, V, rows, cols)."""
-        return torch.tensordot(steps.to(self.slopes), self.slopes, dims=1)
+    def __call__(self, steps: Tensor) -> dict[str, Tensor]:
+        """What steps (K, S) add to the path lengths of each material, shape (K, V, rows, cols)."""
+        return {name: torch.tensordot(steps.to(slopes), slopes, dims=1) for name, slopes in self.slopes.items()}
 
     def stepped(self, steps: Tensor) -> list[FoundScrew]:
         """The screws after steps (S,)."""

@@ -31,6 +31,7 @@ _SOLID_PITCH_FACTOR = 8  # bending is smooth: its energy needs few nodes
 class _MaterialCloud:
     """Nodes of one material: the implant's own, if it is of it, then those of components."""
 
+    material: int  # index in the scene
     holds_implant: bool
     components: list[tuple[int, Tensor]]  # index in the scene, nodes in the implant's frame
     masses: Tensor
@@ -82,12 +83,13 @@ class StageModel:
         self.scene, self.stage, self.config = scene, stage, config
         self.implant = _coarsened(scene.implant, stage.pitch_factor)
         self.screws: ScrewShapes | None = None
+        self._screw_motions: dict[tuple[float, float, float], Tensor] = {}
         self._prepare_motion()
         self._prepare_clouds()
         self._prepare_images(data)
         self.nuisance = Nuisance(scene, config, stage.estimate, self.bin / stage.oversampling)
-        if scene.found and stage.screws == "fit":
-            self.screws = ScrewShapes(scene.found, self.screw_path, scene.tilts)
+        if scene.found and stage.screws is not None:
+            self.screws = ScrewShapes(scene.found, self.screw_path)
         self.tilts = ComponentTilts(scene) if scene.components and stage.tilts else None
         blocks = (self.motion, self.nuisance, self.screws, self.tilts)
         self._sizes = [0 if block is None else block.num_parameters for block in blocks]
@@ -123,13 +125,15 @@ class StageModel:
 
     def _prepare_clouds(self) -> None:
         self.clouds = []
-        for material in self.scene.materials:
+        for index, material in enumerate(self.scene.materials):
             members = [(i, c) for i, c in enumerate(self.scene.components) if c.material == material]
             clouds = [_coarsened(c.cloud, self.stage.pitch_factor) for _, c in members]
             own = [self.implant] if material == self.scene.material else []
+            if not own and not clouds:
+                continue
             masses = torch.cat([cloud.masses for cloud in [*own, *clouds]]).float()
             nodes = [(i, cloud.points.float()) for (i, _), cloud in zip(members, clouds, strict=True)]
-            self.clouds.append(_MaterialCloud(bool(own), nodes, masses))
+            self.clouds.append(_MaterialCloud(index, bool(own), nodes, masses))
 
     def _prepare_images(self, data: RegistrationData) -> None:
         stage = self.stage
@@ -203,35 +207,30 @@ class StageModel:
 
         Where the intensity model knows one, the last of the materials is the background.
         """
-        paths = [
-            project_points(
+        materials = self.scene.materials
+        shape = (len(parameters), len(self.matrices), *self.det_shape)
+        paths = [torch.zeros(()).expand(shape) for _ in materials]
+        for points, cloud, footprint in zip(self.world_points(parameters), self.clouds, self.footprints, strict=True):
+            paths[cloud.material] = project_points(
                 points, cloud.masses, self.matrices, self.det_shape, footprint=footprint, backend=self.config.backend
             )
-            for points, cloud, footprint in zip(
-                self.world_points(parameters), self.clouds, self.footprints, strict=True
-            )
-        ]
         if self.screws:
-            paths[0] = paths[0] + self.screws(self.split(parameters).shapes)
+            for name, added in self.screws(self.split(parameters).shapes).items():
+                paths[materials.index(name)] = paths[materials.index(name)] + added
         if self.scene.is_polyenergetic:
             unknown = torch.zeros(()) if self.background is None else self.background
-            paths.append(unknown.expand_as(paths[0]))
+            paths.append(unknown.expand(shape))
         return torch.stack(paths, dim=-4)
 
     @torch.no_grad()
-    def screw_path(self, screw: FoundScrew, tilt: Tensor | None = None) -> Tensor:
-        """Path lengths (V, rows, cols) in mm of a screw of the implant's material where the scene has it.
-
-        Args:
-            screw: The screw.
-            tilt: Rotation vector (3,) about its start.
-        """
-        component = screw.component("screw", self.scene.material, _SCREW_PITCH_MM)
-        motion = self.scene.implant_to_world @ self.scene.motion_of(component, tilt)
-        points = transform_points(motion, component.cloud.points.double()).float()
-        cell = component.cloud.cell.float() @ motion[:3, :3].float().T
-        footprint = cell_footprint(points, cell, self.matrices)
-        masses, backend = component.cloud.masses.float(), self.config.backend
+    def screw_path(self, screw: FoundScrew) -> Tensor:
+        """Path lengths (V, rows, cols) in mm of a screw where the scene has it."""
+        if screw.start not in self._screw_motions:
+            self._screw_motions[screw.start] = self.scene.implant_to_world @ self.scene.motion_at(screw.start)
+        motion, cloud = self._screw_motions[screw.start], screw.cloud(_SCREW_PITCH_MM)
+        points = transform_points(motion, cloud.points).float()
+        footprint = cell_footprint(points, (cloud.cell @ motion[:3, :3].T).float(), self.matrices)
+        masses, backend = cloud.masses.float(), self.config.backend
         return project_points(points, masses, self.matrices, self.det_shape, footprint=footprint, backend=backend)
 
     def intensity_options(self, parameters: Tensor) -> dict[str, Tensor]:

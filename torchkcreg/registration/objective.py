@@ -129,10 +129,12 @@ class StageObjective:
         self.scene.implant_to_world.copy_(self.scene.implant_to_world @ common.double())
         blocks = self.model.split(parameters)
         self.model.nuisance.accept(blocks.physics)
-        tilts = self.model.tilts.vectors(blocks.tilts) if self.model.tilts else self.scene.tilts
-        if self.model.screws:
-            self.scene.place(self.model.screws.stepped(blocks.shapes), self.config.pitch_mm)
-        self.scene.tilts = tilts.clone()
+        if self.model.tilts:
+            self.scene.tilts = self.model.tilts.vectors(blocks.tilts).clone()
+        if self.scene.found:
+            screws = self.model.screws.stepped(blocks.shapes) if self.model.screws else self.scene.found
+            turned = [s.tilted(tilt) for s, tilt in zip(screws, self.scene.tilts, strict=True)]
+            self.scene.place(turned, self.config.pitch_mm)
 
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:

@@ -41,7 +41,9 @@ def build_scene(
     grid = default_grid(implant.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
     pose = torch.eye(4, dtype=torch.float64) if implant_to_world is None else implant_to_world
     name = config.material or "implant"
-    names = list(dict.fromkeys([name, *(c.material for c in components)]))
+    holes = holes if config.find_screws and not components else ()
+    metals = config.screw_materials if holes and config.material is not None else ()
+    names = list(dict.fromkeys([name, *metals, *(c.material for c in components)]))
     intensity: nn.Module = IdentityIntensity()
     if config.material is not None:
         intensity = PolyenergeticTransmission(
@@ -58,7 +60,8 @@ def build_scene(
         components=components,
         material=name,
         follow_radius_mm=config.follow_radius_mm,
-        holes=holes if config.find_screws and not components else (),
+        holes=holes,
+        metals=metals,
         knows_spectrum=spectrum is not None,
     )
 

@@ -30,6 +30,7 @@ class Scene(nn.Module):
         material: The implant's material; components of the same material share its path length.
         follow_radius_mm: How near to a component's head the implant's nodes tell its motion, mm.
         holes: The implant's holes, where screws that are not among the components may sit.
+        metals: Names of the materials that screws found there may be of, besides the implant's own.
         knows_spectrum: Whether the intensity model's spectrum is the scanner's own, not a likely one.
     """
 
@@ -46,6 +47,7 @@ class Scene(nn.Module):
         material: str = "implant",
         follow_radius_mm: float = 8.0,
         holes: Sequence[Hole] = (),
+        metals: Sequence[str] = (),
         knows_spectrum: bool = True,
     ) -> None:
         super().__init__()
@@ -55,16 +57,17 @@ class Scene(nn.Module):
         self.material = material
         self.follow_radius_mm = follow_radius_mm
         self.holes = list(holes)
+        self.metals = list(metals)
         self.knows_spectrum = knows_spectrum
         self.register_buffer("implant_to_world", implant_to_world.double().clone())
         self.found: list[FoundScrew] = []
         self._set_components(components)
 
     def place(self, screws: Sequence[FoundScrew], pitch: float) -> None:
-        """Makes screws of the implant's material, nodes ``pitch`` mm apart, the only components."""
+        """Makes screws, nodes ``pitch`` mm apart, the only components."""
         self.found = list(screws)
         names = [f"found{index}" for index in range(len(screws))]
-        self._set_components([s.component(n, self.material, pitch) for n, s in zip(names, screws, strict=True)])
+        self._set_components([s.component(n, pitch) for n, s in zip(names, screws, strict=True)])
 
     def _set_components(self, components: Sequence[Component]) -> None:
         self.components = list(components)
@@ -80,21 +83,15 @@ class Scene(nn.Module):
         return bare
 
     @torch.no_grad()
-    def motion_of(self, component: Component, tilt: Tensor | None = None) -> Tensor:
-        """Rigid motion (4, 4) of a component in the implant's frame, whether it is one of the scene's or not.
-
-        Args:
-            component: The component.
-            tilt: Rotation vector (3,) about its head, before it follows the implant.
-        """
-        points = followed_points(self.implant.points, component.head, self.follow_radius_mm).double()
-        motion = fit_rigid(points, points + self.deformation.displacement(points))
-        return motion if tilt is None else motion @ rotation_about(component.head.double(), tilt)
+    def motion_at(self, head: Sequence[float]) -> Tensor:
+        """Rigid motion (4, 4) in the implant's frame of a component whose head is there, a point (3,)."""
+        points = followed_points(self.implant.points, torch.tensor(head), self.follow_radius_mm).double()
+        return fit_rigid(points, points + self.deformation.displacement(points))
 
     @property
     def materials(self) -> list[str]:
         """Names of the materials in the order of the path lengths, the implant's first."""
-        return list(dict.fromkeys([self.material, *(c.material for c in self.components)]))
+        return list(dict.fromkeys([self.material, *self.metals, *(c.material for c in self.components)]))
 
     @property
     def is_polyenergetic(self) -> bool:
@@ -132,7 +129,8 @@ class Scene(nn.Module):
     @torch.no_grad()
     def component_motions(self) -> dict[str, Tensor]:
         """Rigid motion (4, 4) of each component in the implant's frame."""
-        return {c.name: self.motion_of(c, tilt) for c, tilt in zip(self.components, self.tilts, strict=True)}
+        turns = rotation_about(self.heads, self.tilts)
+        return {c.name: self.motion_at(c.head.tolist()) @ t for c, t in zip(self.components, turns, strict=True)}
 
 
 def followed_points(points: Tensor, head: Tensor, radius: float, at_most: int = 200) -> Tensor:

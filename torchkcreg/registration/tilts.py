@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import rotation_about
+from torchkcreg.geometry import across, rotation_about
 
 from .scene import Scene
 
@@ -32,7 +32,7 @@ class ComponentTilts:
         self.lengths = torch.stack(
             [((c.cloud.points.double() - c.head) @ axis).amax() for c, axis in zip(components, axes, strict=True)]
         ).clamp_min(1.0)
-        self.across = torch.stack([_across(axis) for axis in axes])
+        self.across = torch.stack([across(axis) for axis in axes])
         self.likely = math.radians(_LIKELY_FOUND_DEG if scene.found else _LIKELY_DEG)
 
     @property
@@ -52,11 +52,3 @@ class ComponentTilts:
     def penalty(self, parameters: Tensor) -> Tensor:
         """Squared tilts (K,) in standard deviations, summed."""
         return (self.vectors(parameters) / self.likely).square().sum((-2, -1))
-
-
-def _across(axis: Tensor) -> Tensor:
-    """Two unit vectors (2, 3) across an axis."""
-    other = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
-    first = torch.linalg.cross(axis, other)
-    first = first / first.norm()
-    return torch.stack([first, torch.linalg.cross(axis, first)])
