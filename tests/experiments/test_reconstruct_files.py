@@ -111,7 +111,7 @@ def test_screws_that_a_registration_found_are_known_components(small_case, tmp_p
     stages = [{"bin": 4, "iterations": 2, "oversampling": 1, "screws": "find"}]
     overrides = {"material": "steel", "pitch_mm": 1.0, "stages": stages}
     result = register_files(files, tmp_path / "run", overrides=overrides, figures=False)
-    plate, *screws = registered_components(tmp_path / "run")
+    _, *screws = registered_components(tmp_path / "run")
     assert len(screws) == len(result.screws) >= 1
     for screw, found in zip(screws, result.screws, strict=True):
         ends = torch.tensor([found["start"], found["end"]])
