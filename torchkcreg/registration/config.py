@@ -36,7 +36,7 @@ class Stage(BaseModel):
         slide: After a stage of one group, the implant is tried all along its long axis; where it fits elsewhere too,
             the rigid stages run from each place, and what explains the images best goes on.
         screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
-            or those found before have their lengths and radius estimated along ("fit").
+            and their lengths and radii are estimated along, or only the latter ("fit").
         tilts: Components may turn a little about their heads, see :class:`ComponentTilts`.
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
         contrast: The images' contrast counts too (:class:`torchkcreg.similarity.GradientDifference`), not only its

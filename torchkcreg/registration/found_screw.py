@@ -17,7 +17,7 @@ _LENGTH_STEP_MM = 0.5
 _RADIUS_STEP_MM = 0.05
 _RADIUS_UNIT_MM = 0.2  # a unit step in radius changes an image about as much as one in length
 _COMMON_LENGTH_MM, _COMMON_RADIUS_MM = 24.0, 2.0  # about those of most screws
-_LARGEST_STEPS_MM = (4.0, 0.4)  # of length and radius in one stage
+_LARGEST_STEPS = (4.0, 2.0)  # of length and radius in one stage, in units
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def _common_cloud(pitch: float) -> ImplantPointCloud:
 
 
 class ScrewShapes:
-    """Lengths of found screws and their common radius as parameters in mm, linear in the images.
+    """Lengths, then radii of found screws as parameters, linear in the images.
 
     Args:
         screws: The screws.
@@ -105,30 +105,31 @@ class ScrewShapes:
     def __init__(self, screws: Sequence[FoundScrew], render: Callable[[FoundScrew], Tensor]) -> None:
         self.screws = list(screws)
         longer, thicker = _LENGTH_STEP_MM, _RADIUS_STEP_MM
-        lengths = [
+        slopes = [
             (render(s.with_length(s.length + longer)) - render(s.with_length(s.length - longer))) / (2 * longer)
             for s in self.screws
         ]
-        swelling = [
-            render(s.with_radius(s.radius + thicker)) - render(s.with_radius(s.radius - thicker)) for s in self.screws
+        slopes += [
+            (render(s.with_radius(s.radius + thicker)) - render(s.with_radius(s.radius - thicker)))
+            * (_RADIUS_UNIT_MM / (2 * thicker))
+            for s in self.screws
         ]
-        self.slopes = {}
-        for material in dict.fromkeys(s.material for s in self.screws):
-            own = torch.tensor([float(s.material == material) for s in self.screws])
-            thickness = torch.tensordot(own, torch.stack(swelling), dims=1) * (_RADIUS_UNIT_MM / (2 * thicker))
-            self.slopes[material] = torch.cat([own[:, None, None, None] * torch.stack(lengths), thickness[None]])
+        materials = 2 * [s.material for s in self.screws]
+        self.slopes = {
+            name: torch.stack([slope * (name == other) for slope, other in zip(slopes, materials, strict=True)])
+            for name in dict.fromkeys(materials)
+        }
 
     @property
     def num_parameters(self) -> int:
-        """One length a screw, and one radius."""
-        return len(self.screws) + 1
+        """A length and a radius a screw."""
+        return 2 * len(self.screws)
 
     def clamp(self, steps: Tensor) -> Tensor:
         """Steps (K, S) within what the linear images hold for."""
-        lengths, radius = _LARGEST_STEPS_MM
-        limit = torch.full_like(steps, lengths)
-        limit[..., -1] = radius / _RADIUS_UNIT_MM
-        return torch.minimum(torch.maximum(steps, -limit), limit)
+        length, radius = _LARGEST_STEPS
+        lengths, radii = steps.chunk(2, dim=-1)
+        return torch.cat([lengths.clamp(-length, length), radii.clamp(-radius, radius)], dim=-1)
 
     def __call__(self, steps: Tensor) -> dict[str, Tensor]:
         """What steps (K, S) add to the path lengths of each material, shape (K, V, rows, cols)."""
@@ -136,8 +137,7 @@ class ScrewShapes:
 
     def stepped(self, steps: Tensor) -> list[FoundScrew]:
         """The screws after steps (S,)."""
-        *lengths, radius = steps.tolist()
         return [
-            s.with_length(s.length + change).with_radius(s.radius + _RADIUS_UNIT_MM * radius)
-            for s, change in zip(self.screws, lengths, strict=True)
+            s.with_length(s.length + longer).with_radius(s.radius + _RADIUS_UNIT_MM * thicker)
+            for s, (longer, thicker) in zip(self.screws, steps.reshape(2, -1).T.tolist(), strict=True)
         ]

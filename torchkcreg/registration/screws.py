@@ -67,7 +67,7 @@ class _Search:
         self.places = [*scene.found, *(_along(hole, side, scene.material) for hole, side in sides)]
 
     def found_of(self, metal: str) -> list[FoundScrew]:
-        screws = self.alike(self.grow([replace(place, material=metal) for place in self.places]))
+        screws = self.grow([replace(place, material=metal) for place in self.places])
         for index, screw in enumerate(screws):
             screws = self.best_of(screws, index, [screw, *(screw.with_length(length) for length in _LENGTHS_MM)])
         for step in _RADIUS_STEPS:
@@ -79,11 +79,6 @@ class _Search:
                 lengths = [screw.length + change for change in (-step, 0.0, step) if screw.length + change > step]
                 screws = self.best_of(screws, index, [screw.with_length(length) for length in lengths])
         return screws
-
-    def alike(self, screws: list[FoundScrew]) -> list[FoundScrew]:
-        """Screws that all have the median radius: they are of a set."""
-        radius = float(torch.tensor([s.radius for s in screws]).median()) if screws else 0.0
-        return [s.with_radius(radius) for s in screws]
 
     def loss(self, screws: Sequence[FoundScrew]) -> float:
         paths = self.bare.clone()
