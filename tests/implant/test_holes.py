@@ -20,6 +20,14 @@ def test_the_holes_of_a_locking_plate_are_found_in_their_order() -> None:
     assert np.ptp([hole.radius for hole in holes]) < 1e-6
 
 
+def test_the_axis_of_a_countersunk_hole_goes_from_surface_to_surface() -> None:
+    rings = [(2.5, 0.0), (9.0, 0.0), (9.0, 5.0), (3.6, 5.0), (2.5, 3.8), (2.5, 0.0)]
+    plate = trimesh.creation.revolve(np.array(rings), sections=48)
+    (hole,) = find_holes(plate)
+    assert hole.radius == pytest.approx(2.5, abs=0.02)
+    assert hole.depth == pytest.approx(5.0) and hole.center[2] == pytest.approx(2.5)
+
+
 def test_a_hole_turns_and_moves_with_its_mesh() -> None:
     tube = trimesh.creation.annulus(r_min=2.0, r_max=8.0, height=4.0, sections=48)
     motion = trimesh.transformations.euler_matrix(0.3, -0.7, 1.1)

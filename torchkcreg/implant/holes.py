@@ -11,6 +11,7 @@ import trimesh
 _STEEPEST_TURN = np.deg2rad(50.0)  # between neighbouring faces of a hole's wall
 _FLAT = np.deg2rad(3.0)  # in a bent implant the triangles of a wall's facet are no longer in one plane
 _ALONG_AXIS = 0.35  # a wall's normals are at right angles to its axis, but for countersinks
+_RIM = 1.6  # radii from the axis within which a countersink ends
 _OPENING = np.deg2rad(170.0)  # a wall surrounds its screw by more than half: combination holes open into each other
 
 
@@ -22,7 +23,7 @@ class Hole:
         center: Middle of its axis, (3,), in the mesh's frame, mm.
         axis: Direction of its axis, (3,), a unit vector; which of the two ways has no meaning.
         radius: Of its wall where it is narrowest, mm.
-        depth: Length of its wall along the axis, mm.
+        depth: Length of its axis from surface to surface of the implant about it, countersinks included, mm.
     """
 
     center: np.ndarray
@@ -60,7 +61,17 @@ def find_holes(mesh: trimesh.Trimesh, *, smallest_mm: float = 0.75, largest_mm: 
         if hole is not None and smallest_mm <= hole.radius <= largest_mm:
             found = _joined(found, hole)
     spread = np.linalg.svd(merged.vertices - merged.vertices.mean(axis=0), full_matrices=False)[2][0]
-    return sorted(found, key=lambda hole: float(hole.center @ spread))
+    return sorted((_to_the_surfaces(h, merged.vertices) for h in found), key=lambda h: float(h.center @ spread))
+
+
+def _to_the_surfaces(hole: Hole, vertices: np.ndarray) -> Hole:
+    """The hole with its axis from surface to surface: one with a countersink or a step begins above its wall."""
+    spokes = vertices - hole.center
+    along = spokes @ hole.axis
+    aside = np.linalg.norm(spokes - np.outer(along, hole.axis), axis=1)
+    about = (aside < _RIM * hole.radius) & (np.abs(along) < hole.depth / 2 + hole.radius)
+    low, high = along[about].min(), along[about].max()
+    return Hole(hole.center + (low + high) / 2 * hole.axis, hole.axis, hole.radius, float(high - low))
 
 
 def _hole_of(mesh: trimesh.Trimesh, patch: np.ndarray) -> Hole | None:

@@ -66,12 +66,12 @@ class FoundScrew:
         axis = np.subtract(other.end, other.start) / other.length
         return float(np.linalg.norm(way - (way @ axis) * axis)) < self.radius + other.radius
 
-    def tilted(self, rotation: Tensor) -> FoundScrew:
-        """The screw, turned about its start by a rotation vector (3,)."""
-        start = torch.tensor([self.start], dtype=torch.float64)
-        turn = rotation_about(start, rotation.double()[None])[0]
-        x, y, z = transform_points(turn, torch.tensor([self.end], dtype=torch.float64))[0].tolist()
-        return replace(self, end=(x, y, z))
+    def moved(self, rotation: Tensor, shift: Tensor) -> FoundScrew:
+        """The screw, turned about its start by a rotation vector (3,) and then shifted by a vector (3,), mm."""
+        ends = torch.tensor([self.start, self.end], dtype=torch.float64)
+        turned = transform_points(rotation_about(ends[0], rotation.double()), ends) + shift
+        start, end = ((float(x), float(y), float(z)) for x, y, z in turned)
+        return replace(self, start=start, end=end)
 
     def cloud(self, pitch: float) -> ImplantPointCloud:
         """Nodes of the screw, those of a common one stretched: in no time, but on a lattice of its own."""

@@ -133,8 +133,9 @@ class StageObjective:
             self.scene.tilts = self.model.tilts.vectors(blocks.tilts).clone()
         if self.scene.found:
             screws = self.model.screws.stepped(blocks.shapes) if self.model.screws else self.scene.found
-            turned = [s.tilted(tilt) for s, tilt in zip(screws, self.scene.tilts, strict=True)]
-            self.scene.place(turned, self.config.pitch_mm)
+            shifts = self.model.tilts.shifts(blocks.tilts) if self.model.tilts else torch.zeros_like(self.scene.tilts)
+            moved = [s.moved(*by) for s, *by in zip(screws, self.scene.tilts, shifts, strict=True)]
+            self.scene.place(moved, self.config.pitch_mm)
 
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:

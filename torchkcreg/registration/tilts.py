@@ -7,20 +7,21 @@ import math
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import across, rotation_about
+from torchkcreg.geometry import across, rigid_matrix, rotation_about
 
 from .scene import Scene
 
 _LIKELY_DEG = 1.0  # of a component whose direction was told
 _LIKELY_FOUND_DEG = 3.0  # of a screw that was found along its hole
+_LIKELY_SHIFT_MM = 0.2  # of a found screw's head: a hole is that much wider than the screw
 
 
 class ComponentTilts:
-    """Rotations of components about their heads, as millimetres at their far ends.
+    """Rotations of components about their heads, as millimetres at their far ends, and shifts of found screws' heads.
 
     A screw is long: what the smooth deformation makes of a plate's rotation at its hole, a tenth of a degree off, moves
     its tip by more than the plate's own error. With its direction fixed to the plate the long edges of its image would
-    bend the plate.
+    bend the plate. A screw that was found may besides sit anywhere in its hole, which is wider than it.
 
     Args:
         scene: With its components and how they are tilted so far.
@@ -33,22 +34,32 @@ class ComponentTilts:
             [((c.cloud.points.double() - c.head) @ axis).amax() for c, axis in zip(components, axes, strict=True)]
         ).clamp_min(1.0)
         self.across = torch.stack([across(axis) for axis in axes])
+        self.shift = bool(scene.found)
         self.likely = math.radians(_LIKELY_FOUND_DEG if scene.found else _LIKELY_DEG)
 
     @property
     def num_parameters(self) -> int:
-        """Two a component."""
-        return 2 * len(self.lengths)
+        """Two a component; four, where heads shift."""
+        return (4 if self.shift else 2) * len(self.lengths)
 
     def vectors(self, parameters: Tensor) -> Tensor:
-        """Rotation vectors (K, C, 3) in the implant's frame after steps (K, 2 C), mm at the far ends."""
-        steps = parameters.unflatten(-1, (-1, 2)) / self.lengths[:, None]
+        """Rotation vectors (K, C, 3) in the implant's frame after steps (K, D), mm at the far ends."""
+        steps = parameters[..., : 2 * len(self.lengths)].unflatten(-1, (-1, 2)) / self.lengths[:, None]
         return self.scene.tilts + (steps[..., None] * self.across).sum(-2)
+
+    def shifts(self, parameters: Tensor) -> Tensor:
+        """How far the heads move across the axes after steps (K, D), shape (K, C, 3), mm in the implant's frame."""
+        if not self.shift:
+            return parameters.new_zeros(*parameters.shape[:-1], len(self.lengths), 3)
+        steps = parameters[..., 2 * len(self.lengths) :].unflatten(-1, (-1, 2))
+        return (steps[..., None] * self.across).sum(-2)
 
     def motions(self, parameters: Tensor) -> Tensor:
         """Rigid motions (K, C, 4, 4) in the implant's frame."""
-        return rotation_about(self.scene.heads, self.vectors(parameters))
+        turns = rotation_about(self.scene.heads, self.vectors(parameters))
+        return rigid_matrix(torch.zeros_like(self.scene.heads), self.shifts(parameters)) @ turns
 
     def penalty(self, parameters: Tensor) -> Tensor:
-        """Squared tilts (K,) in standard deviations, summed."""
-        return (self.vectors(parameters) / self.likely).square().sum((-2, -1))
+        """Squared tilts and shifts (K,) in standard deviations, summed."""
+        tilts, shifts = self.vectors(parameters) / self.likely, self.shifts(parameters) / _LIKELY_SHIFT_MM
+        return tilts.square().sum((-2, -1)) + shifts.square().sum((-2, -1))
