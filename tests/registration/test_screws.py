@@ -127,3 +127,14 @@ def test_screws_side_by_side_overlap_and_others_do_not() -> None:
     beside = FoundScrew((0.0, 1.5, 18.0), (0.0, -18.0, 18.0), 1.6, "steel")
     apart = FoundScrew((0.0, 1.5, 19.0), (0.0, -18.0, 19.0), 1.6, "steel")
     assert TRUE.overlaps(TRUE.with_length(5.0)) and TRUE.overlaps(beside) and not TRUE.overlaps(apart)
+
+
+@pytest.mark.parametrize("metal", ["steel", "titanium"])
+def test_the_metal_is_the_one_with_which_a_stage_ends_best(mesh: trimesh.Trimesh, metal: str) -> None:
+    motion = pose(0.3, 0.2)
+    screw = replace(TRUE, material=metal)
+    data = image(scene_of(mesh, motion, components=(screw.component("true", 0.5),)), CONFIG)
+    stages = (Stage(bin=2, oversampling=1, screws="choose", contrast=True, tilts=True, iterations=30),)
+    cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
+    result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
+    assert [found["material"] for found in result.screws] == [metal]

@@ -36,7 +36,8 @@ class Stage(BaseModel):
         slide: After a stage of one group, the implant is tried all along its long axis; where it fits elsewhere too,
             the rigid stages run from each place, and what explains the images best goes on.
         screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
-            and their lengths and radii are estimated along, or only the latter ("fit").
+            and their lengths and radii are estimated along; they are found in every metal, the stage runs with each,
+            and what explains the images best stays ("choose"); or those found before are estimated along ("fit").
         tilts: Components may turn a little about their heads, see :class:`ComponentTilts`.
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
         contrast: The images' contrast counts too (:class:`torchkcreg.similarity.GradientDifference`), not only its
@@ -59,7 +60,7 @@ class Stage(BaseModel):
     margin_mm: float | None = Field(6.0, ge=0)
     background: bool = False
     slide: bool = False
-    screws: Literal["find", "fit"] | None = None
+    screws: Literal["find", "choose", "fit"] | None = None
     tilts: bool = False
     robust: bool = False
     contrast: bool = False
@@ -103,7 +104,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
     levels = [
         Stage(bin=8, pitch_factor=4, screws="find", tilts=True),
         Stage(bin=4, screws="find", tilts=True, estimate=("scatter", "hardness"), **seen),
-        Stage(groups=2, bin=4, screws="find", tilts=True, estimate=physics, **seen),
+        Stage(groups=2, bin=4, screws="choose", tilts=True, estimate=physics, **seen),
         Stage(groups=2, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
         Stage(groups=20, modes=40, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
         Stage(groups=20, modes=40, bin=1, estimate=physics, robust=True, screws="fit", tilts=True, **seen),

@@ -22,13 +22,25 @@ _FIRST_RADIUS = 0.8  # of the hole's
 _LENGTHS_MM = (12.0, 18.0, 24.0, 30.0, 36.0, 42.0, 50.0, 60.0, 70.0)
 _LENGTH_STEPS_MM = (4.0, 2.0, 1.0)
 _RADIUS_STEPS = (0.2, 0.1, 0.05, 0.025)  # relative
-_OTHER_METAL = 0.97  # of the loss with the implant's own metal is what another must reach: mixed, they corrode
+OTHER_METAL = 0.97  # of the loss with the implant's own metal is what another must reach: mixed, they corrode
 _LEAST_SHARE = 0.01  # of the loss without screws that one more must take away
 
 
 @torch.no_grad()
 def find_screws(scene: Scene, data: RegistrationData, config: RegistrationConfig, *, bin: int = 4) -> list[FoundScrew]:
-    """Screws of one metal in some of an implant's holes.
+    """Screws of the metal that explains the images best, see :func:`screws_by_metal`."""
+    (best, mark), *others = screws_by_metal(scene, data, config, bin=bin).values()
+    for screws, loss in others:
+        if loss < OTHER_METAL * mark:
+            best, mark = screws, loss / OTHER_METAL
+    return best
+
+
+@torch.no_grad()
+def screws_by_metal(
+    scene: Scene, data: RegistrationData, config: RegistrationConfig, *, bin: int = 4
+) -> dict[str, tuple[list[FoundScrew], float]]:
+    """Screws in some of an implant's holes, and the loss with them, for each metal; the implant's own comes first.
 
     Starting from none, the hole and side whose screw raises gradient correlation most gets one, until the next would
     take away less than a hundredth of the loss. Then they are refined. They are tried along their holes, as locking
@@ -42,13 +54,8 @@ def find_screws(scene: Scene, data: RegistrationData, config: RegistrationConfig
         bin: Detector pixels are averaged in squares of this side.
     """
     search = _Search(scene, data, config, bin)
-    best = search.found_of(scene.material)
-    mark = _OTHER_METAL * search.loss(best)
-    for metal in scene.metals:
-        screws = search.found_of(metal) if metal != scene.material else best
-        if (loss := search.loss(screws)) < mark:
-            best, mark = screws, loss
-    return best
+    found = {metal: search.found_of(metal) for metal in dict.fromkeys([scene.material, *scene.metals])}
+    return {metal: (screws, search.loss(screws)) for metal, screws in found.items()}
 
 
 class _Search:

@@ -23,7 +23,7 @@ from .objective import StageObjective, stage_objective, with_scatter_shape
 from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
-from .screws import find_screws
+from .screws import OTHER_METAL, find_screws, screws_by_metal
 from .verdict import Diagnostics, diagnose, judge
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
@@ -75,7 +75,10 @@ class Trainer:
         for callback in self.callbacks:
             callback.on_stage_start(self, index, stage)
         self._guard.before(stage)
-        self._look_for_screws(stage)
+        if stage.screws == "choose" and self.scene.holes:
+            self._choose_metal(stage, index)
+        else:
+            self._look_for_screws(stage)
         objective = stage_objective(self.scene, self.data, stage, self.config)
 
         def report(progress: Progress) -> None:
@@ -127,6 +130,17 @@ class Trainer:
         self.scene.place(
             find_screws(self.scene, self.data, self.config, bin=min(stage.bin, _SCREW_BIN)), self.config.pitch_mm
         )
+
+    def _choose_metal(self, stage: Stage, seed: int) -> None:
+        """Places the screws of the metal with which the stage ends best: coarse images without it tell metals badly."""
+        options = screws_by_metal(self.scene, self.data, self.config, bin=min(stage.bin, _SCREW_BIN))
+        ends = []
+        for number, (screws, _) in enumerate(options.values()):
+            self.scene.place(screws, self.config.pitch_mm)
+            objective = stage_objective(self.scene, self.data, stage, self.config)
+            end = minimize(objective, stage, seed=self.config.seed + seed, report=lambda progress: None)
+            ends.append((float(objective.losses(end[None])[0]) * (1.0 if number else OTHER_METAL), screws))
+        self.scene.place(min(ends, key=lambda end: end[0])[1], self.config.pitch_mm)
 
     def _result(self) -> RegistrationResult:
         scene = self.scene
