@@ -13,6 +13,8 @@ from torch import Tensor
 
 from .config import Stage
 
+_NEGLIGIBLE = 2e-5  # of the loss
+
 
 class Problem(Protocol):
     """What an optimiser needs to know of a stage."""
@@ -104,7 +106,8 @@ def adam(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:
 def gauss_newton(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:
     """Gauss-Newton with Levenberg-Marquardt damping (Marquardt 1963) and steps of at most ``stage.step_mm``.
 
-    The gradient is exact; the curvature is taken once and again when steps stop agreeing with it.
+    The gradient is exact; the curvature is taken once and again when steps stop agreeing with it. It also ends with a
+    step that is taken and promised next to nothing: it moved what the images hardly show by micrometres.
     """
     parameters = torch.zeros(problem.num_parameters, dtype=torch.float64)
     loss, gradient = problem.loss_and_gradient(parameters)
@@ -119,7 +122,8 @@ def gauss_newton(problem: Problem, stage: Stage, seed: int, report: Report) -> T
         trial_loss = float(problem.losses(trial[None])[0])
         size = float(step.abs().max())
         gain = (loss - trial_loss) / max(predicted, 1e-16)
-        if trial_loss < loss:
+        taken = trial_loss < loss
+        if taken:
             parameters = trial
             loss, gradient = problem.loss_and_gradient(parameters)
             damping = max(damping / 5, 1e-6) if gain > 0.5 else damping * 2
@@ -127,7 +131,7 @@ def gauss_newton(problem: Problem, stage: Stage, seed: int, report: Report) -> T
         else:
             damping *= 8
         report(Progress(iteration, loss, size))
-        if size < stage.tolerance:
+        if size < stage.tolerance or (taken and predicted < _NEGLIGIBLE * loss):
             break
         if not fresh and gain < 0.25:
             curvature, fresh = problem.curvature(parameters), True
