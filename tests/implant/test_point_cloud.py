@@ -199,3 +199,13 @@ def test_volumes_without_metal_and_impossible_thresholds_are_refused() -> None:
             ImplantPointCloud.from_volume(volume, grid, threshold=threshold, metal_value=metal)
     with pytest.raises(ValueError, match="factor"):
         ImplantPointCloud.from_mesh(trimesh.creation.box((2, 2, 2)), 0.5).coarsened(0)
+
+
+def test_a_coarsened_cloud_is_made_once_and_again_when_the_nodes_change() -> None:
+    cloud = ImplantPointCloud.from_mesh(trimesh.creation.box((4.0, 4.0, 8.0)), pitch=0.5)
+    coarse = cloud.coarsened(2)
+    assert cloud.coarsened(2) is coarse and cloud.coarsened(4) is not coarse
+    with torch.no_grad():
+        cloud.masses.mul_(0.5)
+    assert cloud.coarsened(2).volume == pytest.approx(coarse.volume / 2)
+    assert cloud.double().coarsened(2).points.dtype == torch.float64

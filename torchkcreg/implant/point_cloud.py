@@ -64,6 +64,7 @@ class ImplantPointCloud(nn.Module):
         self.register_buffer("points", points[order])
         self.register_buffer("masses", masses.to(points)[order])
         self.register_buffer("cell", cell.to(points))
+        self._coarser: dict[tuple[int, ...], ImplantPointCloud] = {}
 
     @classmethod
     def from_mesh(
@@ -173,10 +174,18 @@ class ImplantPointCloud(nn.Module):
     def coarsened(self, factor: int) -> ImplantPointCloud:
         """Cloud on a lattice ``factor`` times as coarse: the nodes of ``factor^3`` cells merge at their centroid.
 
-        Masses and centroids are exact, for fast first stages of a registration.
+        Masses and centroids are exact, for fast first stages of a registration. Made once and kept: leave it as it is.
         """
         if int(factor) != factor or factor < 1:
             raise ValueError(f"factor must be a positive integer, got {factor}")
+        buffers = (self.points, self.masses, self.cell)
+        key = (int(factor), *(number for b in buffers for number in (b.data_ptr(), b._version)))
+        if key not in self._coarser:
+            self._coarser = {kept: cloud for kept, cloud in self._coarser.items() if kept[1:] == key[1:]}
+            self._coarser[key] = self._coarsened(int(factor))
+        return self._coarser[key]
+
+    def _coarsened(self, factor: int) -> ImplantPointCloud:
         in_cells = self.points.double() @ torch.linalg.inv(self.cell.double())
         # The heaviest node's cell is full, so that it stands at its centre: surface nodes lie anywhere in theirs.
         lattice = torch.round(in_cells - in_cells[self.masses.argmax()]).long()
