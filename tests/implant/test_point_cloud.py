@@ -209,3 +209,9 @@ def test_a_coarsened_cloud_is_made_once_and_again_when_the_nodes_change() -> Non
         cloud.masses.mul_(0.5)
     assert cloud.coarsened(2).volume == pytest.approx(coarse.volume / 2)
     assert cloud.double().coarsened(2).points.dtype == torch.float64
+
+
+def test_a_cloud_made_in_inference_mode_coarsens_too() -> None:
+    with torch.inference_mode():
+        cloud = ImplantPointCloud.from_mesh(trimesh.creation.box((4.0, 4.0, 8.0)), pitch=0.5)
+    assert cloud.coarsened(2).volume == pytest.approx(cloud.volume)

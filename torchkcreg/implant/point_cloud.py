@@ -179,7 +179,8 @@ class ImplantPointCloud(nn.Module):
         if int(factor) != factor or factor < 1:
             raise ValueError(f"factor must be a positive integer, got {factor}")
         buffers = (self.points, self.masses, self.cell)
-        key = (int(factor), *(number for b in buffers for number in (b.data_ptr(), b._version)))
+        versions = (0 if b.is_inference() else b._version for b in buffers)  # inference tensors have none
+        key = (int(factor), *(b.data_ptr() for b in buffers), *versions)
         if key not in self._coarser:
             self._coarser = {kept: cloud for kept, cloud in self._coarser.items() if kept[1:] == key[1:]}
             self._coarser[key] = self._coarsened(int(factor))

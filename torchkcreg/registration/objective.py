@@ -131,7 +131,7 @@ class StageObjective:
         self.model.nuisance.accept(blocks.physics)
         if self.model.tilts:
             self.scene.tilts = self.model.tilts.vectors(blocks.tilts).clone()
-        if self.scene.found:
+        if self.scene.found and (self.model.screws or self.model.tilts):
             screws = self.model.screws.stepped(blocks.shapes) if self.model.screws else self.scene.found
             shifts = self.model.tilts.shifts(blocks.tilts) if self.model.tilts else torch.zeros_like(self.scene.tilts)
             moved = [s.moved(*by) for s, *by in zip(screws, self.scene.tilts, shifts, strict=True)]

@@ -22,24 +22,26 @@ _FIRST_RADIUS = 0.8  # of the hole's
 _LENGTHS_MM = (12.0, 18.0, 24.0, 30.0, 36.0, 42.0, 50.0, 60.0, 70.0)
 _LENGTH_STEPS_MM = (4.0, 2.0, 1.0)
 _RADIUS_STEPS = (0.2, 0.1, 0.05, 0.025)  # relative
-OTHER_METAL = 0.97  # of the loss with the implant's own metal is what another must reach: mixed, they corrode
+_OTHER_METAL = 0.97  # of the loss with the implant's own metal is what another must reach: mixed, they corrode
 _LEAST_SHARE = 0.01  # of the loss without screws that one more must take away
 
 
 @torch.no_grad()
 def find_screws(scene: Scene, data: RegistrationData, config: RegistrationConfig, *, bin: int = 4) -> list[FoundScrew]:
     """Screws of the metal that explains the images best, see :func:`screws_by_metal`."""
-    (best, mark), *others = screws_by_metal(scene, data, config, bin=bin).values()
-    for screws, loss in others:
-        if loss < OTHER_METAL * mark:
-            best, mark = screws, loss / OTHER_METAL
-    return best
+    return of_best_metal(screws_by_metal(scene, data, config, bin=bin))
+
+
+def of_best_metal(found: Sequence[tuple[list[FoundScrew], float]]) -> list[FoundScrew]:
+    """The screws of least loss; the first ones, of the implant's own metal, have an advantage."""
+    losses = [loss * (1.0 if number else _OTHER_METAL) for number, (_, loss) in enumerate(found)]
+    return found[losses.index(min(losses))][0]
 
 
 @torch.no_grad()
 def screws_by_metal(
     scene: Scene, data: RegistrationData, config: RegistrationConfig, *, bin: int = 4
-) -> dict[str, tuple[list[FoundScrew], float]]:
+) -> list[tuple[list[FoundScrew], float]]:
     """Screws in some of an implant's holes, and the loss with them, for each metal; the implant's own comes first.
 
     Starting from none, the hole and side whose screw raises gradient correlation most gets one, until the next would
@@ -54,8 +56,8 @@ def screws_by_metal(
         bin: Detector pixels are averaged in squares of this side.
     """
     search = _Search(scene, data, config, bin)
-    found = {metal: search.found_of(metal) for metal in dict.fromkeys([scene.material, *scene.metals])}
-    return {metal: (screws, search.loss(screws)) for metal, screws in found.items()}
+    found = [search.found_of(metal) for metal in dict.fromkeys([scene.material, *scene.metals])]
+    return [(screws, search.loss(screws)) for screws in found]
 
 
 class _Search:
@@ -69,7 +71,6 @@ class _Search:
         self.bare = self.model.path_lengths(self.model.at_rest)
         self.options = self.model.intensity_options(self.model.at_rest)
         self.rendered: dict[FoundScrew, Tensor] = {}
-        self.materials = scene.materials
         sides = [(hole, side) for hole in scene.holes for side in (-1.0, 1.0)]
         self.places = [*scene.found, *(_along(hole, side, scene.material) for hole, side in sides)]
 
@@ -90,7 +91,7 @@ class _Search:
     def loss(self, screws: Sequence[FoundScrew]) -> float:
         paths = self.bare.clone()
         for screw in screws:
-            paths[:, self.materials.index(screw.material)] += self._path(screw)
+            paths[:, self.scene.materials.index(screw.material)] += self._path(screw)
         lines = self.scene.intensity(paths, pooling=self.model.stage.oversampling, **self.options)
         return 1.0 - float(self.similarity(lines).mean())
 

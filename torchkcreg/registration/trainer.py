@@ -23,7 +23,7 @@ from .objective import StageObjective, stage_objective, with_scatter_shape
 from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
-from .screws import OTHER_METAL, find_screws, screws_by_metal
+from .screws import find_screws, of_best_metal, screws_by_metal
 from .verdict import Diagnostics, diagnose, judge
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
@@ -135,12 +135,12 @@ class Trainer:
         """Places the screws of the metal with which the stage ends best: coarse images without it tell metals badly."""
         options = screws_by_metal(self.scene, self.data, self.config, bin=min(stage.bin, _SCREW_BIN))
         ends = []
-        for number, (screws, _) in enumerate(options.values()):
+        for screws, _ in options:
             self.scene.place(screws, self.config.pitch_mm)
             objective = stage_objective(self.scene, self.data, stage, self.config)
             end = minimize(objective, stage, seed=self.config.seed + seed, report=lambda progress: None)
-            ends.append((float(objective.losses(end[None])[0]) * (1.0 if number else OTHER_METAL), screws))
-        self.scene.place(min(ends, key=lambda end: end[0])[1], self.config.pitch_mm)
+            ends.append((screws, float(objective.losses(end[None])[0])))
+        self.scene.place(of_best_metal(ends), self.config.pitch_mm)
 
     def _result(self) -> RegistrationResult:
         scene = self.scene
