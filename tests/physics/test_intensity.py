@@ -109,18 +109,20 @@ def test_every_input_and_parameter_can_be_differentiated():
 
 def test_scatter_follows_its_shape_over_the_detector():
     model = PolyenergeticTransmission([STEEL], tungsten_spectrum(90), scatter=0.2)
-    lengths, shape = random_lengths(1, 1, 2, 6, 6), 0.5 + torch.rand(2, 6, 6, dtype=torch.float64)
+    lengths, shapes = random_lengths(1, 1, 2, 6, 6), 0.5 + torch.rand(2, 2, 6, 6, dtype=torch.float64)
     primary = torch.exp(-model(lengths, scatter=torch.zeros(1)))
-    expected = -torch.log(primary + 0.2 * shape) + math.log(1.2)
-    torch.testing.assert_close(model(lengths, scatter_shape=shape), expected)
+    expected = -torch.log(primary + 0.2 * shapes[0] + 0.1 * shapes[1]) + math.log(1.2)
+    removed = torch.tensor([0.1], dtype=torch.float64)
+    torch.testing.assert_close(model(lengths, scatter_removed=removed, scatter_shapes=shapes), expected)
 
 
-def test_gradients_know_the_shape_of_the_scatter():
+def test_gradients_know_the_shapes_of_the_scatter():
     model = PolyenergeticTransmission([STEEL], tungsten_spectrum(90), num_bins=3)
-    lengths, shape = random_lengths(1, 1, 1, 4, 4).requires_grad_(), torch.rand(1, 2, 2, dtype=torch.float64)
-    scatter = torch.tensor([0.1], dtype=torch.float64, requires_grad=True)
+    lengths, shapes = random_lengths(1, 1, 1, 4, 4).requires_grad_(), torch.rand(2, 1, 2, 2, dtype=torch.float64)
+    scatter, removed = (torch.tensor([s], dtype=torch.float64, requires_grad=True) for s in (0.1, 0.2))
     assert torch.autograd.gradcheck(
-        lambda x, s: model(x, scatter=s, pooling=2, scatter_shape=shape), (lengths, scatter)
+        lambda x, s, r: model(x, scatter=s, scatter_removed=r, pooling=2, scatter_shapes=shapes),
+        (lengths, scatter, removed),
     )
 
 
@@ -146,7 +148,7 @@ def test_the_weights_and_kernel_of_the_operation_can_be_differentiated():
         torch.tensor([[0.2, 0.5]], dtype=torch.float64),
         torch.tensor([[0.4, 0.6], [0.3, 0.7]], dtype=torch.float64),
         torch.tensor([[0.1, 0.7, 0.2], [0.2, 0.5, 0.3]], dtype=torch.float64),
-        torch.tensor([0.0, 0.1], dtype=torch.float64),
+        torch.tensor([0.0, 0.1], dtype=torch.float64).reshape(2, 1, 1, 1),
     ]
     for i in (0, 2, 3, 4):
         inputs[i].requires_grad_()

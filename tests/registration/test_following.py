@@ -15,39 +15,44 @@ SHAPE = (2, 48, 40)
 
 
 def images() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Primary of a bar, a smooth factor, and how scatter is spread."""
+    """Primary of a bar, a smooth factor, and how both kinds of scatter are spread."""
     rows, cols = torch.meshgrid(torch.arange(48.0), torch.arange(40.0), indexing="ij")
     bar = torch.where((cols - 20).abs() < 4, 0.2, 0.8).expand(SHAPE)
-    return bar, (0.7 + 0.004 * rows).expand(SHAPE), (0.5 + 0.01 * cols).expand(SHAPE)
+    return (
+        bar,
+        (0.7 + 0.004 * rows).expand(SHAPE),
+        torch.stack([0.5 + 0.01 * cols, 0.9 - 0.01 * cols])[:, None].expand(2, *SHAPE),
+    )
 
 
-@pytest.mark.parametrize("scatter", [0.0, 0.2])
-def test_a_smooth_factor_of_the_primary_is_followed_whatever_the_scatter(scatter: float) -> None:
-    bar, factor, shape = images()
-    measured = -torch.log(bar * factor + scatter * shape)
-    lines = math.log1p(scatter) - torch.log(bar + scatter * shape)
-    followed = FollowingBackground(measured, torch.ones(SHAPE, dtype=torch.bool), shape, 5.0)
-    result = followed(lines[None], torch.tensor([scatter]))[0]
+@pytest.mark.parametrize(("scatter", "removed"), [(0.0, 0.0), (0.2, 0.0), (0.1, 0.15)])
+def test_a_smooth_factor_of_the_primary_is_followed_whatever_the_scatter(scatter: float, removed: float) -> None:
+    bar, factor, shapes = images()
+    scattered = scatter * shapes[0] + removed * shapes[1]
+    measured = -torch.log(bar * factor + scattered)
+    lines = math.log1p(scatter) - torch.log(bar + scattered)
+    followed = FollowingBackground(measured, torch.ones(SHAPE, dtype=torch.bool), shapes, 5.0)
+    result = followed(lines[None], torch.tensor([[scatter, removed]]))[0]
     inner = (slice(None), slice(8, -8), slice(None))
     assert float((result - math.log1p(scatter) - measured)[inner].abs().max()) < 0.02
     assert float((lines - math.log1p(scatter) - measured)[inner].abs().max()) > 0.1
 
 
 def test_pixels_that_do_not_count_change_nothing() -> None:
-    bar, factor, shape = images()
+    bar, factor, shapes = images()
     measured = -torch.log(bar * factor)
     mask = torch.ones(SHAPE, dtype=torch.bool)
     mask[:, 20:24, 10:14] = False
     spoilt = torch.where(mask, measured, 9.0)
-    lines, none = -torch.log(bar)[None], torch.zeros(1)
-    first, second = (FollowingBackground(m, mask, shape, 5.0)(lines, none) for m in (measured, spoilt))
+    lines, none = -torch.log(bar)[None], torch.zeros(1, 2)
+    first, second = (FollowingBackground(m, mask, shapes, 5.0)(lines, none) for m in (measured, spoilt))
     torch.testing.assert_close(first, second)
 
 
 def test_no_primary_gives_no_nan() -> None:
-    shape = images()[2]
-    followed = FollowingBackground(torch.full(SHAPE, 3.0), torch.ones(SHAPE, dtype=torch.bool), shape, 5.0)
-    result = followed(torch.full((1, *SHAPE), 12.0), torch.tensor([0.5]))
+    shapes = images()[2]
+    followed = FollowingBackground(torch.full(SHAPE, 3.0), torch.ones(SHAPE, dtype=torch.bool), shapes, 5.0)
+    result = followed(torch.full((1, *SHAPE), 12.0), torch.tensor([[0.5, 0.2]]))
     assert bool(result.isfinite().all())
 
 

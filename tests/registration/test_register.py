@@ -105,7 +105,8 @@ def test_the_scatter_floor_is_estimated() -> None:
         material="steel", scatter=0.1, prior_weight=0.0, stages=(Stage(estimate=("scatter",), tolerance=1e-4),), **GRID
     )
     data = image(scene(config, pose(0.2, 0.2)), config)
-    data = replace(data, scatter_shape=torch.ones_like(data.line_integrals))
+    even = torch.ones_like(data.line_integrals)
+    data = replace(data, scatter_shapes=torch.stack([even, 0 * even]))
     guess = config.model_copy(update={"scatter": 0.03})
     result = register(plate(), data, guess)
     assert result.intensity["scatter"] == pytest.approx(0.1, abs=0.005)

@@ -95,6 +95,18 @@ def test_a_parameter_that_ends_at_its_bound_is_named() -> None:
     assert Nuisance(here, physical, ("scatter", "blur"), 1.0).at_bounds(0.01) == ["scatter"]
 
 
+def test_a_bound_where_a_parameter_is_likely_to_be_says_nothing() -> None:
+    """Nothing may be scattered from what a limb removes, but scanners without any scatter there are hardly."""
+    physical = RegistrationConfig(material="steel", stages=(Stage(estimate=("scatter", "removed")),))
+    here = scene(physical)
+    nuisance = Nuisance(here, physical, ("scatter", "removed"), 1.0)
+    assert float(here.intensity.get_parameter("scatter_removed")) == 0.0
+    assert nuisance.at_bounds(0.01) == []
+    with torch.no_grad():
+        here.intensity.get_parameter("scatter").fill_(0.0)
+    assert Nuisance(here, physical, ("scatter", "removed"), 1.0).at_bounds(0.01) == ["scatter"]
+
+
 def test_screws_that_were_found_ask_for_more() -> None:
     same = replace(GOOD, node_std_mm=0.05)
     assert judge(same)[0] == "ok"

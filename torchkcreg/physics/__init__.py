@@ -4,6 +4,7 @@ from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
 from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
 from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission
 from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
+from torchkcreg.physics.scatter import scatter_shapes, scattered_signal
 from torchkcreg.physics.spectra import Spectrum, tungsten_spectrum
 from torchkcreg.physics.transmission import polyenergetic_line_integrals
 
@@ -21,5 +22,7 @@ __all__ = [
     "material_names",
     "mixture",
     "polyenergetic_line_integrals",
+    "scatter_shapes",
+    "scattered_signal",
     "tungsten_spectrum",
 ]

@@ -10,6 +10,7 @@ from torch.nn.functional import avg_pool2d
 
 from torchkcreg.physics.blur import gaussian_kernel
 from torchkcreg.physics.materials import Material, material
+from torchkcreg.physics.scatter import scattered_signal
 from torchkcreg.physics.spectra import Spectrum
 from torchkcreg.physics.transmission import polyenergetic_line_integrals
 
@@ -34,21 +35,24 @@ class IdentityIntensity(nn.Module):
 class PolyenergeticTransmission(nn.Module):
     """Line integrals behind several materials, with beam hardening, the system's blur and a scatter floor.
 
-    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s) + ln(1 + s)`; zero where nothing stands in the beam. The blur
-    acts on intensities, before the logarithm, as it does in the detector; with hardening it moves apparent edges.
+    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s p + r q) + ln(1 + s)`; zero where nothing stands in the beam. The
+    blur acts on intensities, before the logarithm, as it does in the detector; with hardening it moves apparent edges.
+    Scatter comes with what passes the object, `s p` (Sun & Star-Lack 2010), and from what the object takes from the
+    beam, `r q` (Ohnesorge et al. 1999).
 
     Args:
         materials: The materials, in the order of the path lengths' M.
         spectrum: The detected spectrum. It is reduced to the fewest energies that transmit alike.
-        scatter: Smooth scatter in units of the open beam, s.
+        scatter: Scatter s that comes with what passes, in units of the open beam.
+        scatter_removed: Scatter r from what is removed; it needs a shape.
         blur_sigma_px: Standard deviation of the system's point spread, pixels.
         hardness: Filtration added to the spectrum (taken away where negative), mm of aluminium:
             `w_k *= exp(-mu_Al(E_k) hardness)`, normalised again.
         num_bins: The most energies kept; None keeps the spectrum's own.
 
     Attributes:
-        scatter, blur_sigma_px, hardness: Scalar parameters, float64, which a fit may move. The gradient to
-            `blur_sigma_px` vanishes at zero: start a fit of it from a third of a pixel or more.
+        scatter, scatter_removed, blur_sigma_px, hardness: Scalar parameters, float64, which a fit may move. The
+            gradient to `blur_sigma_px` vanishes at zero: start a fit of it from a third of a pixel or more.
         energies_kev, weights, attenuation: Buffers: the energies kept `(B,)`, their weights `(B,)`, and the materials'
             attenuation `(M, B)` in 1/mm.
 
@@ -73,6 +77,7 @@ class PolyenergeticTransmission(nn.Module):
         spectrum: Spectrum,
         *,
         scatter: float = 0.0,
+        scatter_removed: float = 0.0,
         blur_sigma_px: float = 0.0,
         hardness: float = 0.0,
         num_bins: int | None = 20,
@@ -80,12 +85,14 @@ class PolyenergeticTransmission(nn.Module):
         super().__init__()
         if not materials:
             raise ValueError("materials must hold at least one material, got none")
-        for name, value in (("scatter", scatter), ("blur_sigma_px", blur_sigma_px)):
+        named = {"scatter": scatter, "scatter_removed": scatter_removed, "blur_sigma_px": blur_sigma_px}
+        for name, value in named.items():
             if not value >= 0:
                 raise ValueError(f"{name} must not be negative, got {value}")
         kept = spectrum if num_bins is None else spectrum.reduced(materials, num_bins)
         self.material_names = tuple(m.name for m in materials)
         self.scatter = _parameter(scatter)
+        self.scatter_removed = _parameter(scatter_removed)
         self.blur_sigma_px = _parameter(blur_sigma_px)
         self.hardness = _parameter(hardness)
         self.register_buffer("energies_kev", torch.tensor(kept.energies_kev, dtype=torch.float64))
@@ -98,23 +105,25 @@ class PolyenergeticTransmission(nn.Module):
         path_lengths: Tensor,
         *,
         scatter: Tensor | None = None,
+        scatter_removed: Tensor | None = None,
         blur_sigma_px: Tensor | None = None,
         hardness: Tensor | None = None,
         pooling: int = 1,
-        scatter_shape: Tensor | None = None,
+        scatter_shapes: Tensor | None = None,
     ) -> Tensor:
         """Line integrals `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)` in mm.
 
         Args:
             path_lengths: Path lengths, one image a material and view, any leading candidate axes.
             scatter: Per candidate, in place of the module's own: a scalar or of the shape of the candidate axes.
+            scatter_removed: As `scatter`.
             blur_sigma_px: As `scatter`.
             hardness: As `scatter`.
             pooling: Transmissions are averaged over squares of this many pixels a side after the blur. Path lengths on
                 pixels finer than the detector's follow sharp edges better: an average of exponentials is not the
                 exponential of the average.
-            scatter_shape: How the scatter is spread over the detector, of shape (V, rows, cols) after pooling, as a
-                factor of `scatter`; evenly if None.
+            scatter_shapes: How both kinds of scatter are spread over the detector, p and q, of shape
+                (2, V, rows, cols) after pooling. None: p is even, and q is nothing.
 
         Raises:
             ValueError: If the path lengths' M is not the number of materials, or an override fits no candidate axis, or
@@ -125,13 +134,20 @@ class PolyenergeticTransmission(nn.Module):
         # the few numbers a candidate in the module's own precision; the images in theirs
         hardness = _per_candidate("hardness", self.hardness, hardness, leading)
         sigma = _per_candidate("blur_sigma_px", self.blur_sigma_px, blur_sigma_px, leading)
-        floor = _per_candidate("scatter", self.scatter, scatter, leading)
         weights = torch.softmax(self.weights.log() - hardness[:, None] * self.aluminium, dim=-1)
         flat = path_lengths.reshape(-1, *path_lengths.shape[-4:])
-        result = polyenergetic_line_integrals(
-            flat, self.attenuation, weights, gaussian_kernel(sigma), floor, pooling, scatter_shape
+        levels = self._scatter_levels(scatter, scatter_removed, leading)
+        scattered = scattered_signal(levels, scatter_shapes)
+        lines = polyenergetic_line_integrals(
+            flat, self.attenuation, weights, gaussian_kernel(sigma), scattered, pooling
         )
+        result = lines + torch.log1p(levels[:, 0]).to(lines)[:, None, None, None]
         return result.reshape(*leading, *result.shape[-3:])
+
+    def _scatter_levels(self, passed: Tensor | None, removed: Tensor | None, leading: torch.Size) -> Tensor:
+        """Levels (K, 2) of both kinds of scatter."""
+        own = {"scatter": (self.scatter, passed), "scatter_removed": (self.scatter_removed, removed)}
+        return torch.stack([_per_candidate(name, *levels, leading) for name, levels in own.items()], dim=-1)
 
     def extra_repr(self) -> str:
         """Materials and number of energies."""

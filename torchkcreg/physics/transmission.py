@@ -21,29 +21,26 @@ def polyenergetic_line_integrals(
     kernel: Tensor,
     scatter: Tensor,
     pooling: int = 1,
-    scatter_shape: Tensor | None = None,
 ) -> Tensor:
     """Line integrals `(K, V, rows, cols)` of materials' path lengths `(K, M, V, rows, cols)`.
 
-    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s q) + ln(1 + s)`, candidate by candidate; only images of the size
-    of the result are kept for the gradient, whatever the number of energies.
+    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s)`, candidate by candidate; only images of the size of the result
+    are kept for the gradient, whatever the number of energies.
 
     Args:
         path_lengths: Path lengths in mm, `(K, M, V, rows, cols)`.
         attenuation: Attenuation coefficients in 1/mm, `(M, energies)`; no gradient.
         weights: Weights of the energies, `(K, energies)`.
         kernel: One-dimensional blur kernels, `(K, odd)`, applied along rows and columns.
-        scatter: Scatter floors in units of the open beam, `(K,)`.
+        scatter: Scatter s in units of the open beam, of a shape that broadcasts to that of the result.
         pooling: Blurred transmissions are averaged over squares of this many pixels a side, which divides the images.
-        scatter_shape: How the scatter is spread over the detector, q of shape `(V, rows, cols)` after pooling; no
-            gradient. Evenly, q = 1, if None.
 
     Returns:
         Differentiable once, in everything but the attenuation.
     """
-    return _PolyenergeticLineIntegrals.apply(
-        path_lengths, attenuation, weights, kernel, scatter, pooling, scatter_shape
-    )
+    num_candidates, _, views, rows, cols = path_lengths.shape
+    spread = scatter.to(path_lengths).expand(num_candidates, views, rows // pooling, cols // pooling)
+    return _PolyenergeticLineIntegrals.apply(path_lengths, attenuation, weights, kernel, spread, pooling)
 
 
 class _PolyenergeticLineIntegrals(torch.autograd.Function):
@@ -58,44 +55,39 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
         kernel: Tensor,
         scatter: Tensor,
         pooling: int,
-        scatter_shape: Tensor | None,
     ) -> Tensor:
-        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter, scatter_shape)
+        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter)
         ctx.pooling = pooling
         coefficients = attenuation.tolist()
-        num_candidates, _, *image_shape = path_lengths.shape
-        views, rows, cols = image_shape
-        result = path_lengths.new_empty(num_candidates, views, rows // pooling, cols // pooling)
-        settings = zip(weights.tolist(), kernel.tolist(), scatter.tolist())
-        for candidate, (shares, blur, floor) in enumerate(settings):
+        image_shape = path_lengths.shape[2:]
+        result = path_lengths.new_empty(scatter.shape)
+        for candidate, (shares, blur) in enumerate(zip(weights.tolist(), kernel.tolist())):
             lengths = path_lengths[candidate].flatten(1)
             signal = transmitted(lengths, coefficients, shares).view(image_shape)
             for view in range(image_shape[0]):
                 blurred = _pooled(convolve(convolve(signal[view], blur, -2), blur, -1), pooling)
                 out = result[candidate, view]
-                level = floor if scatter_shape is None else floor * scatter_shape[view]
-                _add_floor(blurred, level, out=out).log_().neg_().add_(_log1p(floor))
+                _add_floor(blurred, scatter[candidate, view], out=out).log_().neg_()
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        path_lengths, attenuation, weights, kernel, scatter, scatter_shape = ctx.saved_tensors
+        path_lengths, attenuation, weights, kernel, scatter = ctx.saved_tensors
         coefficients = attenuation.tolist()
-        wants_lengths, _, wants_weights, wants_kernel, wants_scatter, *_ = ctx.needs_input_grad
+        wants_lengths, _, wants_weights, wants_kernel, wants_scatter, _ = ctx.needs_input_grad
         grad_lengths = torch.empty_like(path_lengths) if wants_lengths else None
-        grad_weights, grad_kernel, grad_scatter = [], [], []
-        settings = zip(weights.tolist(), kernel.tolist(), scatter.tolist())
-        for candidate, (shares, blur, floor) in enumerate(settings):
+        grad_scatter = torch.empty(scatter.shape).to(scatter) if wants_scatter else None
+        grad_weights, grad_kernel = [], []
+        for candidate, (shares, blur) in enumerate(zip(weights.tolist(), kernel.tolist())):
             lengths = path_lengths[candidate].flatten(1)
             signal = transmitted(lengths, coefficients, shares).view(path_lengths.shape[2:])
             along_rows = convolve(signal, blur, -2)
             blurred = _pooled(convolve(along_rows, blur, -1), ctx.pooling)
-            level = floor if scatter_shape is None else floor * scatter_shape
-            grad_signal = _add_floor(blurred, level, out=blurred).reciprocal_().mul_(upstream[candidate]).neg_()
-            if wants_scatter:
-                shaped = grad_signal if scatter_shape is None else grad_signal * scatter_shape
-                grad_scatter.append(float(shaped.sum()) + float(upstream[candidate].sum()) / (1 + floor))
+            total = _add_floor(blurred, scatter[candidate], out=blurred)
+            grad_signal = total.reciprocal_().mul_(upstream[candidate]).neg_()
+            if grad_scatter is not None:
+                grad_scatter[candidate] = grad_signal
             grad_signal = _spread(grad_signal, ctx.pooling)
             grad_rows = convolve_adjoint(grad_signal, blur, -1)
             if wants_kernel:
@@ -111,8 +103,7 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
             None,
             weights.new_tensor(grad_weights) if wants_weights else None,
             kernel.new_tensor(grad_kernel) if wants_kernel else None,
-            scatter.new_tensor(grad_scatter) if wants_scatter else None,
-            None,
+            grad_scatter,
             None,
         )
 
@@ -166,11 +157,6 @@ def _spread(images: Tensor, pooling: int) -> Tensor:
     return (images / pooling**2).repeat_interleave(pooling, -2).repeat_interleave(pooling, -1)
 
 
-def _add_floor(signal: Tensor, floor: float | Tensor, *, out: Tensor) -> Tensor:
+def _add_floor(signal: Tensor, floor: Tensor, *, out: Tensor) -> Tensor:
     """Signal plus floor, kept positive: a negative floor must not turn into NaN."""
     return torch.add(signal, floor, out=out).clamp_min_(torch.finfo(signal.dtype).tiny)
-
-
-def _log1p(floor: float) -> float:
-    """`ln(1 + floor)` as a number."""
-    return float(torch.log1p(torch.tensor(floor, dtype=torch.float64)))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchkcreg.physics import gaussian_blur
+from torchkcreg.physics import gaussian_blur, scattered_signal
 
 from .config import RegistrationConfig, Stage
 from .data import RegistrationData, resized
@@ -59,10 +59,9 @@ class _BackgroundFit:
 
     def __call__(self) -> Tensor:
         """Path length B (V, rows, cols), mm."""
-        scatter = float(self.intensity.get_parameter("scatter").detach())
-        physics = {**self.physics, "scatter": torch.zeros(1)}
-        shape = self.model.data.scatter_shape
-        primary = self.measured - scatter * (1.0 if shape is None else shape)
+        levels = torch.stack([self.physics["scatter"], self.physics["scatter_removed"]], dim=-1)
+        physics = {**self.physics, "scatter": torch.zeros(1), "scatter_removed": torch.zeros(1)}
+        primary = self.measured - scattered_signal(levels, self.model.data.scatter_shapes)[0]
         background = torch.zeros_like(primary)
         for _ in range(_ITERATIONS):
             known = self._transmission(background, physics)

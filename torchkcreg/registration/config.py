@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 OptimizerName = Literal["gauss-newton", "cmaes", "adam"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
-NuisanceName = Literal["scatter", "blur", "hardness"]
+NuisanceName = Literal["scatter", "removed", "blur", "hardness"]
 
 _COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
 
@@ -99,11 +99,11 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         slide=True,
         screws="find",
     )
-    physics: tuple[NuisanceName, ...] = ("scatter", "blur", "hardness")
+    physics: tuple[NuisanceName, ...] = ("scatter", "removed", "blur", "hardness")
     seen = {"pitch_factor": 2, "background": True, "contrast": True}
     levels = [
         Stage(bin=8, pitch_factor=4, screws="find", tilts=True),
-        Stage(bin=4, screws="find", tilts=True, estimate=("scatter", "hardness"), **seen),
+        Stage(bin=4, screws="find", tilts=True, estimate=("scatter", "removed", "hardness"), **seen),
         Stage(groups=2, bin=4, screws="choose", tilts=True, estimate=physics, **seen),
         Stage(groups=2, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
         Stage(groups=20, modes=40, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),

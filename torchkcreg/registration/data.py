@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.physics import gaussian_blur
+from torchkcreg.physics import scatter_shapes
 
 _SCATTER_BLOCK = 8  # scatter is smooth: its shape is found on blocks of this many pixels squared
 
@@ -28,7 +28,8 @@ class RegistrationData:
             it, shape (V, rows, cols), mm; None where nothing is known of it.
         background_mm: Smoothness of an estimated background, standard deviation in mm at the detector; it then follows
             each candidate. 0 where the background is known.
-        scatter_shape: How scatter is spread over the detector, shape (V, rows, cols); evenly if None.
+        scatter_shapes: How scatter is spread over the detector, shape (2, V, rows, cols), see
+            :func:`torchkcreg.physics.scatter_shapes`; evenly if None.
 
     Raises:
         ValueError: If the views or the pixels of geometry and images differ, or no pixel is left.
@@ -39,7 +40,7 @@ class RegistrationData:
     mask: Tensor = None  # type: ignore[assignment]  # set below
     background: Tensor | None = None
     background_mm: float = 0.0
-    scatter_shape: Tensor | None = None
+    scatter_shapes: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.line_integrals.shape)
@@ -140,17 +141,14 @@ class RegistrationData:
         estimates = self._estimates(continued)
         return RegistrationData(geometry, window(self.line_integrals), window(self.mask), **estimates)
 
-    def with_scatter_shape(self, sigma_mm: float) -> RegistrationData:
-        """The data with a shape of the scatter: the measured transmission, blurred by ``sigma_mm`` at the detector.
-
-        Scatter comes from where the primary beam comes through, and is spread widely (Sun & Star-Lack 2010).
-        """
+    def with_scatter_shapes(self, sigma_mm: float) -> RegistrationData:
+        """The data with the shapes of the scatter, ``sigma_mm`` broad at the detector."""
         factor = min(_SCATTER_BLOCK, *self.geometry.det_shape)
         sigma = sigma_mm / self.geometry.pixel_spacing[1] / factor
         transmission = adaptive_avg_pool2d(torch.exp(-self.line_integrals) * self.mask, self._blocks(factor))
         share = adaptive_avg_pool2d(self.mask.float(), self._blocks(factor))
-        smooth = gaussian_blur(transmission, sigma) / gaussian_blur(share, sigma).clamp_min(1e-3)
-        return replace(self, scatter_shape=resized(smooth, self.geometry.det_shape))
+        shapes = scatter_shapes(transmission / share.clamp_min(1e-3), share, sigma)
+        return replace(self, scatter_shapes=torch.stack([resized(s, self.geometry.det_shape) for s in shapes]))
 
     def _blocks(self, factor: int) -> tuple[int, int]:
         rows, cols = self.geometry.det_shape
@@ -158,9 +156,9 @@ class RegistrationData:
 
     def _estimates(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
         """What is estimated about the images, each image changed."""
-        known = {"background": self.background, "scatter_shape": self.scatter_shape}
-        changed = {name: None if image is None else change(image) for name, image in known.items()}
-        return {**changed, "background_mm": self.background_mm}
+        background = None if self.background is None else change(self.background)
+        shapes = None if self.scatter_shapes is None else torch.stack([change(s) for s in self.scatter_shapes])
+        return {"background": background, "scatter_shapes": shapes, "background_mm": self.background_mm}
 
 
 def resized(images: Tensor, det_shape: tuple[int, int]) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from torchkcreg.physics import gaussian_blur
+from torchkcreg.physics import gaussian_blur, scattered_signal
 
 PIXELS_OF_SIGMA = 0.4  # a pixel is no larger than this share of the smoothness
 _LEAST = 1e-4  # primary, in units of the open beam
@@ -24,25 +24,25 @@ class FollowingBackground:
     Args:
         measured: Line integrals -ln I, shape (V, rows, cols).
         mask: Where they count.
-        scatter_shape: How scatter is spread over the detector; evenly if None.
+        scatter_shapes: How scatter is spread over the detector, shape (2, V, rows, cols); evenly if None.
         sigma_px: Smoothness of the background, pixels.
     """
 
-    def __init__(self, measured: Tensor, mask: Tensor, scatter_shape: Tensor | None, sigma_px: float) -> None:
+    def __init__(self, measured: Tensor, mask: Tensor, scatter_shapes: Tensor | None, sigma_px: float) -> None:
         self.intensity, self.mask = torch.exp(-measured), mask
-        self.scatter_shape = torch.ones(()) if scatter_shape is None else scatter_shape
+        self.scatter_shapes = scatter_shapes
         self.block = max(1, int(PIXELS_OF_SIGMA * sigma_px))
         self.sigma = sigma_px / self.block
 
-    def __call__(self, lines: Tensor, scatter: Tensor) -> Tensor:
+    def __call__(self, lines: Tensor, levels: Tensor) -> Tensor:
         """DRRs (K, V, rows, cols) with the background that goes with them.
 
         Args:
             lines: DRRs, zero where nothing stands in the beam.
-            scatter: In units of the open beam, shape (K,).
+            levels: Of both kinds of scatter, shape (K, 2).
         """
-        level = scatter.to(lines)[:, None, None, None]
-        scattered = level * self.scatter_shape
+        level = levels[:, 0].to(lines)[:, None, None, None]
+        scattered = scattered_signal(levels.to(lines), self.scatter_shapes)
         primary = ((1 + level) * torch.exp(-lines) - scattered).clamp_min(_LEAST)
         seen = primary * self.mask
         wanted = self._smooth(seen * (self.intensity - scattered))

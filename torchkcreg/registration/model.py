@@ -153,8 +153,8 @@ class StageModel:
             self.background = resized(behind, fine.det_shape)
         if self.background is not None and self.data.background_mm > 0:
             sigma = self.data.background_mm / self.data.geometry.pixel_spacing[1]
-            measured, shape = self.data.line_integrals, self.data.scatter_shape
-            self.following = FollowingBackground(measured, self.data.mask, shape, sigma)
+            measured, shapes = self.data.line_integrals, self.data.scatter_shapes
+            self.following = FollowingBackground(measured, self.data.mask, shapes, sigma)
         cell = self.implant.cell.float() @ self.scene.implant_to_world[:3, :3].float().T
         self.footprints = [cell_footprint(points[0], cell, self.matrices) for points in at_start]
 
@@ -236,8 +236,8 @@ class StageModel:
     def intensity_options(self, parameters: Tensor) -> dict[str, Tensor]:
         """Keyword arguments of the intensity model for candidates (K, D)."""
         options = self.nuisance(self.split(parameters).physics)
-        if self.data.scatter_shape is not None and self.scene.is_polyenergetic:
-            options["scatter_shape"] = self.data.scatter_shape
+        if self.data.scatter_shapes is not None and self.scene.is_polyenergetic:
+            options["scatter_shapes"] = self.data.scatter_shapes
         return options
 
     def line_integrals(self, parameters: Tensor) -> Tensor:
@@ -246,8 +246,8 @@ class StageModel:
         lines = self.scene.intensity(paths, pooling=self.stage.oversampling, **options)
         if self.following is None:
             return lines
-        scatter = options.get("scatter", self.scene.intensity.get_parameter("scatter").detach().expand(len(lines)))
-        return self.following(lines, scatter)
+        levels = torch.stack([options["scatter"], options["scatter_removed"]], dim=-1)
+        return self.following(lines, levels)
 
 
 def _coarsened(cloud: ImplantPointCloud, factor: int) -> ImplantPointCloud:

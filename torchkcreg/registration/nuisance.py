@@ -14,6 +14,7 @@ from .scene import Scene
 # radiograph about as much as a millimetre of motion, so that one step size suits all parameters.
 _PARAMETERS = {
     "scatter": ("scatter", 0.05, 0.0, 0.9),
+    "removed": ("scatter_removed", 0.05, 0.0, 0.9),
     "blur": ("blur_sigma_px", 0.5, 0.1, 5.0),
     "hardness": ("hardness", 2.0, -5.0, 20.0),
 }
@@ -45,6 +46,7 @@ class Nuisance:
         self.low, self.high = (low - self.start) / self.scale, (high - self.start) / self.scale
         likely = {
             "scatter": (config.scatter, _LIKELY_SCATTER),
+            "removed": (0.0, _LIKELY_SCATTER),
             "blur": (config.blur_px, _LIKELY_BLUR * config.blur_px),
             "hardness": (0.0, _LIKELY_HARDNESS_MM[scene.knows_spectrum]),
         }
@@ -65,9 +67,10 @@ class Nuisance:
         return torch.minimum(torch.maximum(steps, self.low), self.high)
 
     def at_bounds(self, share: float) -> list[str]:
-        """Names of the parameters that are within a share of their range of a bound that is not their start's."""
+        """Names of the parameters that are within a share of their range of a bound where they are not likely to be."""
         margin = share * (self.high - self.low)
-        near = (self.low > -margin) | (self.high < margin)
+        likely = (self.likely[:, 0] - self.start) / self.scale
+        near = ((self.low > -margin) & (likely > self.low)) | ((self.high < margin) & (likely < self.high))
         return [name for name, is_near in zip(self.names, near.tolist(), strict=True) if is_near]
 
     def values(self, steps: Tensor) -> Tensor:
@@ -77,9 +80,10 @@ class Nuisance:
     def __call__(self, steps: Tensor) -> dict[str, Tensor]:
         """Keyword arguments of the intensity model, each of shape (K,); the blur in the images' own pixels."""
         values = dict(zip(self.attributes, self.values(steps).unbind(-1), strict=True))
-        if "blur_sigma_px" in self.own:
-            blur = values.get("blur_sigma_px", self.own["blur_sigma_px"].detach().expand(len(steps)))
-            values["blur_sigma_px"] = blur / self.pixel_size
+        for name, own in self.own.items():
+            values.setdefault(name, own.detach().expand(len(steps)))
+        if "blur_sigma_px" in values:
+            values["blur_sigma_px"] = values["blur_sigma_px"] / self.pixel_size
         return {name: value.float() for name, value in values.items()}
 
     @torch.no_grad()

@@ -140,7 +140,7 @@ class StageObjective:
 
 def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> StageObjective:
     """The objective of a stage at the scene's present state, with the background that the stage asks for."""
-    data = with_scatter_shape(scene, data, config)
+    data = with_scatter_shapes(scene, data, config)
     if stage.background and scene.is_polyenergetic:
         pixel = data.geometry.pixel_spacing[1]
         width = max(config.background_mm, _BACKGROUND_PIXELS * stage.binning(pixel) * pixel)
@@ -148,8 +148,8 @@ def stage_objective(scene: Scene, data: RegistrationData, stage: Stage, config: 
     return StageObjective(scene, data, stage, config)
 
 
-def with_scatter_shape(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
-    """The data with a shape of the scatter, where the intensity model has scatter."""
-    if not scene.is_polyenergetic or data.scatter_shape is not None:
+def with_scatter_shapes(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
+    """The data with the shapes of the scatter, where the intensity model has scatter."""
+    if not scene.is_polyenergetic or data.scatter_shapes is not None:
         return data
-    return data.with_scatter_shape(config.scatter_mm)
+    return data.with_scatter_shapes(config.scatter_mm)

@@ -19,7 +19,7 @@ from .config import RegistrationConfig, Stage
 from .data import RegistrationData
 from .found_screw import FoundScrew
 from .guard import Guard
-from .objective import StageObjective, stage_objective, with_scatter_shape
+from .objective import StageObjective, stage_objective, with_scatter_shapes
 from .optimizers import Progress, minimize
 from .result import RegistrationResult
 from .scene import Scene
@@ -46,7 +46,7 @@ class Trainer:
         self, scene: Scene, data: RegistrationData, config: RegistrationConfig, *, callbacks: Sequence[Callback] = ()
     ) -> None:
         self.scene, self.config, self.callbacks = scene, config, list(callbacks)
-        self.data = with_scatter_shape(scene, data, config)
+        self.data = with_scatter_shapes(scene, data, config)
         self.stages = config.schedule()
         self.next_stage = 0
         self.history: list[dict[str, Any]] = []
