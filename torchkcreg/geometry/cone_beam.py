@@ -8,14 +8,18 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from torchkcreg.geometry.checks import checked_matrices, checked_shape
+from torchkcreg.geometry.orientation import looking_signs, turned_towards
+
 
 class ConeBeamGeometry(nn.Module):
     """Views of a cone-beam system: ``u = P0.X / P2.X`` (column), ``v = P1.X / P2.X`` (row), X = (x, y, z, 1) in mm.
 
     The matrices are the truth about a view; with ``P = [M | m]``, the source is at ``-M^-1 m`` and the ray of pixel
     (u, v) runs along ``M^-1 (u, v, 1)``. Pixel centres lie at integers, counted from 0. On construction each matrix is
-    scaled so that its row 2 gives the depth in mm along the detector's normal, positive at the world's origin. Any
-    invertible M will do: tilted detectors, cropped images, rows that run up or down.
+    scaled so that its row 2 gives the depth in mm along the detector's normal, positive in front of the source: where
+    the views' central rays meet, see `looking_signs`. Any invertible M will do: tilted detectors, cropped images, rows
+    that run up or down, a world whose origin is at or behind a source.
 
     Args:
         projection_matrices: (V, 3, 4), any scale and sign.
@@ -26,6 +30,7 @@ class ConeBeamGeometry(nn.Module):
 
     Attributes:
         projection_matrices: buffer (V, 3, 4), float64 whatever the module is cast to.
+        knows_front: whether the views themselves tell what is in front of them; else :meth:`facing` may.
 
     Raises:
         ValueError: shapes, labels or numbers that don't make a geometry.
@@ -49,10 +54,10 @@ class ConeBeamGeometry(nn.Module):
         angles_deg: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
-        matrices = _checked_matrices(projection_matrices)
-        if bool((matrices[:, 2, 3] == 0).any()):
-            raise ValueError("projection_matrices must not have the world's origin at depth 0")
-        self._set_up(matrices * matrices[:, 2:, 3:].sign().detach(), det_shape, pixel_spacing, sources, angles_deg)
+        matrices = checked_matrices(projection_matrices)
+        det_shape = checked_shape(det_shape)
+        signs, knows_front = looking_signs(matrices.detach(), det_shape)
+        self._set_up(matrices * signs[:, None, None], det_shape, pixel_spacing, sources, angles_deg, knows_front)
 
     def _set_up(
         self,
@@ -61,14 +66,14 @@ class ConeBeamGeometry(nn.Module):
         pixel_spacing: Sequence[float],
         sources: Sequence[str] | None,
         angles_deg: Sequence[float] | None,
+        knows_front: bool,
     ) -> None:
-        if len(det_shape) != 2 or any(int(n) != n or n < 1 for n in det_shape):
-            raise ValueError(f"det_shape must be two positive integers (rows, cols), got {tuple(det_shape)}")
         if len(pixel_spacing) != 2 or not all(math.isfinite(d) and d > 0 for d in pixel_spacing):
             raise ValueError(f"pixel_spacing must be two positive lengths (dv, du) in mm, got {tuple(pixel_spacing)}")
         self.register_buffer("projection_matrices", matrices)
-        self.det_shape = (int(det_shape[0]), int(det_shape[1]))
+        self.det_shape = checked_shape(det_shape)
         self.pixel_spacing = (float(pixel_spacing[0]), float(pixel_spacing[1]))
+        self.knows_front = knows_front
         self.sources = None if sources is None else tuple(str(source) for source in sources)
         self.angles_deg = None if angles_deg is None else tuple(float(angle) for angle in angles_deg)
         for name, labels in (("sources", self.sources), ("angles_deg", self.angles_deg)):
@@ -77,7 +82,8 @@ class ConeBeamGeometry(nn.Module):
 
     def _derived(self, matrices: Tensor, **changes: object) -> ConeBeamGeometry:
         """This geometry with other matrices; unlike the constructor, the sign of the depth stays as it is."""
-        fields: dict = {name: getattr(self, name) for name in ("det_shape", "pixel_spacing", "sources", "angles_deg")}
+        names = ("det_shape", "pixel_spacing", "sources", "angles_deg", "knows_front")
+        fields: dict = {name: getattr(self, name) for name in names}
         geometry = ConeBeamGeometry.__new__(ConeBeamGeometry)
         nn.Module.__init__(geometry)
         geometry._set_up(matrices, **(fields | changes))
@@ -154,6 +160,16 @@ class ConeBeamGeometry(nn.Module):
         homogeneous = points.double().unsqueeze(-3) @ matrices[:, :, :3].mT + matrices[:, None, :, 3]
         depth = homogeneous[..., 2]
         return (homogeneous[..., :2] / depth.unsqueeze(-1)).to(points.dtype), depth.to(points.dtype)
+
+    def facing(self, points: Tensor) -> ConeBeamGeometry:
+        """The geometry with these world points (N, 3) in front of every source.
+
+        Views that do not tell themselves what is in front (see `knows_front`) are turned so that the points' mean is.
+
+        Raises:
+            ValueError: a point lies at or behind a source.
+        """
+        return self._derived(turned_towards(self.projection_matrices, points, keep=self.knows_front))
 
     def select(self, views: Sequence[int] | slice) -> ConeBeamGeometry:
         """The geometry of some views, in the order given; labels stay with their views."""
@@ -241,17 +257,4 @@ class ConeBeamGeometry(nn.Module):
         """
         if tuple(transform.shape) not in ((4, 4), (self.num_views, 4, 4)):
             raise ValueError(f"transform must have shape (4, 4) or (V, 4, 4), got {tuple(transform.shape)}")
-        return self._derived(_checked_matrices(self.projection_matrices @ transform.to(self.projection_matrices)))
-
-
-def _checked_matrices(matrices: Tensor) -> Tensor:
-    """Projection matrices in float64 with unit normals in row 2."""
-    matrices = torch.as_tensor(matrices).double()
-    if matrices.ndim != 3 or tuple(matrices.shape[1:]) != (3, 4) or len(matrices) == 0:
-        raise ValueError(f"projection_matrices must have shape (V, 3, 4), got {tuple(matrices.shape)}")
-    if not bool(matrices.isfinite().all()):
-        raise ValueError("projection_matrices must be finite")
-    rows = matrices[:, :, :3] / matrices[:, :, :3].norm(dim=-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-    if bool((torch.linalg.det(rows).abs() < 1e-9).any()):
-        raise ValueError("projection_matrices must have an invertible left 3 x 3 part")
-    return matrices / matrices[:, 2:, :3].norm(dim=-1, keepdim=True)
+        return self._derived(checked_matrices(self.projection_matrices @ transform.to(self.projection_matrices)))

@@ -67,6 +67,10 @@ class RegistrationData:
         """Number of views V."""
         return self.line_integrals.shape[0]
 
+    def facing(self, points: Tensor) -> RegistrationData:
+        """The data with these world points (N, 3) in front of every source, see :meth:`ConeBeamGeometry.facing`."""
+        return replace(self, geometry=self.geometry.facing(points))
+
     def select(self, views: list[int]) -> RegistrationData:
         """The given views alone, in the given order."""
         estimates = self._estimates(lambda image: image[views])

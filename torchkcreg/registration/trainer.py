@@ -11,8 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import transform_points
-
 from .basins import Rival, places
 from .callbacks import Callback
 from .config import RegistrationConfig, Stage
@@ -40,13 +38,16 @@ class Trainer:
 
     A checkpoint (:meth:`state_dict`) is complete at the end of a stage: a trainer that loads it continues with the
     next stage and ends with the same bits as one that was never stopped.
+
+    Raises:
+        ValueError: If the implant lies behind a source at its start pose.
     """
 
     def __init__(
         self, scene: Scene, data: RegistrationData, config: RegistrationConfig, *, callbacks: Sequence[Callback] = ()
     ) -> None:
         self.scene, self.config, self.callbacks = scene, config, list(callbacks)
-        self.data = with_scatter_shapes(scene, data, config)
+        self.data = with_scatter_shapes(scene, data.facing(scene.nodes()), config)
         self.stages = config.schedule()
         self.next_stage = 0
         self.history: list[dict[str, Any]] = []
@@ -56,7 +57,7 @@ class Trainer:
 
     def check(self) -> None:
         """Raises ValueError if the implant lies outside every view at its start pose."""
-        points = transform_points(self.scene.implant_to_world, self.scene.implant.points.double())
+        points = self.scene.nodes(1)
         self.data.windowed(points, (self.stages[0].margin_mm or 0.0) / self.data.geometry.pixel_spacing[1])
 
     def fit(self) -> RegistrationResult:

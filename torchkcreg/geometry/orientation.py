@@ -1,0 +1,79 @@
+"""Which way views look: a projection matrix and its negative see the same lines, in opposite directions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_LEAST_ANGLE = 1e-3  # rad between central rays; less, and where they meet is anybody's guess
+_AT_SOURCE = 1e-3  # of the largest depth
+_FURTHEST = 0.5  # of its depth, by which central rays may miss the point where they meet
+
+
+def looking_signs(matrices: Tensor, det_shape: tuple[int, int]) -> tuple[Tensor, bool]:
+    """Signs (V,) that make depths positive in front of the source, and whether the views themselves tell them.
+
+    Views of one object look at it: the lines from the sources through the middles of their detectors pass near a point,
+    which lies in front of all of them. Where they do not (one view, parallel ones, one source that turns), the world's
+    origin is taken to be in front; where that is the source, a matrix keeps its sign.
+
+    Args:
+        matrices: (V, 3, 4), float64, row 2 with a unit normal.
+        det_shape: (rows, cols).
+    """
+    point = _meeting_point(matrices, det_shape)
+    if point is not None:
+        depths = _depths_of(matrices, point[None])[:, 0]
+        if bool((depths.abs() > _AT_SOURCE * depths.abs().max()).all()):
+            return depths.sign(), True
+    at_origin = matrices[:, 2, 3]
+    from_source = torch.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:]).squeeze(-1).norm(dim=-1)
+    known = at_origin.abs() > 1e-9 * from_source.clamp_min(1e-9)
+    return torch.where(known, at_origin.sign(), torch.ones_like(at_origin)), False
+
+
+def turned_towards(matrices: Tensor, points: Tensor, *, keep: bool) -> Tensor:
+    """Matrices (V, 3, 4) that have world points (N, 3) in front of their sources.
+
+    Args:
+        matrices: (V, 3, 4), float64, row 2 with a unit normal.
+        points: Positions in mm.
+        keep: Signs are known, and stay.
+
+    Raises:
+        ValueError: a point lies at or behind a source.
+    """
+    points = points.to(matrices)
+    if not keep:
+        depth = _depths_of(matrices, points.mean(0, keepdim=True))
+        matrices = matrices * torch.where(depth < 0, -1.0, 1.0)[..., None]
+    nearest = _depths_of(matrices, points).amin(-1)
+    if behind := (nearest <= 0).nonzero().flatten().tolist():
+        raise ValueError(
+            f"the object lies behind the X-ray source of view {', '.join(map(str, behind))} "
+            f"(depth {float(nearest.min()):.0f} mm): check its frame, its unit and its pose"
+        )
+    return matrices
+
+
+def _depths_of(matrices: Tensor, points: Tensor) -> Tensor:
+    """Depths (V, N) of points (N, 3)."""
+    return matrices[:, 2, :3] @ points.mT + matrices[:, 2, 3:]
+
+
+def _meeting_point(matrices: Tensor, det_shape: tuple[int, int]) -> Tensor | None:
+    """The point (3,) with the smallest squared distances from the central rays; None where they hardly cross."""
+    rows, cols = det_shape
+    middle = matrices.new_tensor([(cols - 1) / 2, (rows - 1) / 2, 1.0])
+    inverse = torch.linalg.inv(matrices[:, :, :3])
+    sources = -(inverse @ matrices[:, :, 3:]).squeeze(-1)
+    along = inverse @ middle
+    along = along / along.norm(dim=-1, keepdim=True)
+    across = torch.eye(3).to(matrices) - along[:, :, None] * along[:, None, :]
+    mean = across.mean(0)
+    if float(torch.linalg.eigvalsh(mean)[0]) < _LEAST_ANGLE**2:
+        return None
+    point = torch.linalg.solve(mean, (across @ sources[:, :, None]).mean(0)).squeeze(-1)
+    missed = (across @ (point - sources)[:, :, None]).squeeze(-1).norm(dim=-1)
+    distance = (point - sources).norm(dim=-1)
+    return point if bool((missed <= _FURTHEST * distance).all()) else None
