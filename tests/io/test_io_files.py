@@ -73,7 +73,7 @@ def test_json_that_is_none_is_named_with_the_line(tmp_path):
 
 
 def test_a_binary_file_is_no_text(tmp_path):
-    (tmp_path / "bad.json").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "bad.json").write_bytes(b"\xff\xd8\x00\x81")
     with pytest.raises(ValueError, match=r"bad\.json is not a text file"):
         read_json(tmp_path / "bad.json", "geometry")
 

@@ -9,17 +9,19 @@ import torch
 from torch import Tensor
 
 from torchkcreg.io.files import write_text
-from torchkcreg.io.tables import read_table
+from torchkcreg.io.tables import Column, read_table
+
+_XYZ = [Column(axis, "mm") for axis in "xyz"]
 
 
 def read_points(path: str | os.PathLike[str]) -> Tensor:
-    """Points (N, 3) float64 in mm from a CSV whose first three columns are x, y, z (header optional).
+    """Points (N, 3) float64 in mm from a text table: columns named x, y, z, or three columns without names.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a line is not three finite numbers; the message names it.
+        ValueError: it is no such table, see `torchkcreg.io.read_table`; the message names the line.
     """
-    return torch.from_numpy(read_table(path, "points", ("x", "y", "z")))
+    return torch.from_numpy(read_table(path, "points", _XYZ))
 
 
 def write_points(path: str | os.PathLike[str], points: Tensor, **columns: Tensor) -> None:

@@ -5,20 +5,24 @@ from __future__ import annotations
 import os
 
 from torchkcreg.io.files import write_text
-from torchkcreg.io.tables import read_table
+from torchkcreg.io.tables import Column, read_table
 from torchkcreg.physics import Spectrum
 
 _LARGEST_KEV = 1000.0
+_COLUMNS = [
+    Column("energy", "keV", ("e", "energies", "photon energy")),
+    Column("weight", "", ("weights", "detected weight", "detected energy weight", "counts", "fluence"), any_name=True),
+]
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
-    """The spectrum of a CSV file: energy in keV and the weight with which the detector counts it (any scale).
+    """The spectrum of a text table: energy in keV and the weight with which the detector counts it (any scale).
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: energies are not positive, not rising, or too large for keV; a weight is negative, or all are 0.
     """
-    table = read_table(path, "spectrum", ("energy in keV", "weight"))
+    table = read_table(path, "spectrum", _COLUMNS)
     energies, weights = table[:, 0], table[:, 1]
     if energies.min() <= 0 or energies.max() > _LARGEST_KEV:
         raise ValueError(
