@@ -1,6 +1,6 @@
 """Known components: an implant as a point cloud of nodes, volumes and cells, from a mesh or from a volume; screws."""
 
-from torchkcreg.implant.closed_mesh import closed_triangles
+from torchkcreg.implant.closed_mesh import closed_mesh, closed_triangles
 from torchkcreg.implant.components import Component, cylinder_cloud, cylinder_mesh
 from torchkcreg.implant.holes import Hole, find_holes
 from torchkcreg.implant.morton import morton_order
@@ -13,6 +13,7 @@ __all__ = [
     "FilledCells",
     "Hole",
     "ImplantPointCloud",
+    "closed_mesh",
     "closed_triangles",
     "cylinder_cloud",
     "cylinder_mesh",

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+_MOST_BODIES = 1000  # that are looked at one by one
 
 
 def closed_triangles(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Triangles (m, 3, 3), float64, of a closed mesh, wound counter-clockwise seen from outside.
+    """Triangles (m, 3, 3), float64, of a closed mesh, wound counter-clockwise seen from outside; see `closed_mesh`."""
+    return np.array(closed_mesh(mesh).triangles, dtype=np.float64)
 
-    Vertices at the same place are merged first, since STL files repeat them. Inverted meshes are turned inside out, and
-    mixed winding is repaired; the mesh passed in stays as it is.
+
+def closed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A closed mesh whose faces are wound counter-clockwise seen from outside; the mesh passed in stays as it is.
+
+    Vertices at the same place are merged first, since STL files repeat them, and faces that are there twice are taken
+    once. Inverted meshes are turned inside out, mixed winding is repaired; of several bodies each that is inside out is
+    turned, unless it lies in another one: then it is a cavity.
 
     Raises:
         ValueError: the mesh has open edges (their number is given), no volume, or a surface that has no two sides.
@@ -21,25 +32,76 @@ def closed_triangles(mesh: trimesh.Trimesh) -> np.ndarray:
         raise ValueError("mesh must have finite vertices")
     merged = trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)
-    faces = merged.faces
-    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    merged.update_faces(distinct)  # slivers that the merging closed up
-    _, uses = np.unique(merged.edges_sorted, axis=0, return_counts=True)
-    if (uses % 2).any():
-        raise ValueError(f"mesh must be closed, got {int((uses % 2).sum())} open edges")
-    if not _two_sided(merged):
-        trimesh.repair.fix_winding(merged)
-        if not _two_sided(merged):
-            raise ValueError("mesh must have an inside and an outside, but its faces cannot be wound consistently")
-    triangles = np.array(merged.triangles, dtype=np.float64)
-    volume = np.linalg.det(triangles - triangles.mean((0, 1))).sum() / 6  # of the tetrahedra below the triangles
-    if abs(volume) <= 1e-12 * float(merged.extents.max()) ** 3:
+    faces = _distinct(np.asarray(merged.faces, dtype=np.int64))
+    if len(faces) == 0 or np.ptp(merged.vertices, axis=0).max() == 0:
         raise ValueError("mesh must enclose a volume, got none")
-    return triangles if volume > 0 else triangles[:, ::-1]
+    keys, _ = _edges(faces)
+    odd = int((np.unique(keys, return_counts=True)[1] % 2).sum())
+    if odd:
+        raise ValueError(f"mesh must be closed, got {odd} open edges")
+    if not _two_sided(faces):
+        mixed = trimesh.Trimesh(merged.vertices, faces, process=False)
+        trimesh.repair.fix_winding(mixed)
+        faces = np.asarray(mixed.faces, dtype=np.int64)
+        if not _two_sided(faces):
+            raise ValueError("mesh must have an inside and an outside, but its faces cannot be wound consistently")
+    faces = _turned_outwards(np.asarray(merged.vertices), faces)
+    return trimesh.Trimesh(merged.vertices, faces, process=False)
 
 
-def _two_sided(mesh: trimesh.Trimesh) -> bool:
+def _distinct(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Faces without slivers that the merging closed up, and without repetitions of the same winding."""
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    first = faces.argmin(1)[:, None]
+    rolled = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)  # begins with its smallest vertex
+    order = np.lexsort(rolled.T)
+    again = np.zeros(len(faces), bool)
+    again[order[1:]] = (rolled[order[1:]] == rolled[order[:-1]]).all(1)
+    return faces[~again]
+
+
+def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """A number for each edge of each face, the same for both ways along it, and whether it is walked upwards."""
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    return low * (int(faces.max()) + 1) + high, start < end
+
+
+def _two_sided(faces: NDArray[np.int64]) -> bool:
     """Whether each edge is walked as often one way as the other."""
-    forward = mesh.edges[:, 0] < mesh.edges[:, 1]
-    _, inverse = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
-    return not np.bincount(inverse.ravel(), weights=np.where(forward, 1.0, -1.0)).any()
+    keys, upwards = _edges(faces)
+    return bool(np.array_equal(np.sort(keys[upwards]), np.sort(keys[~upwards])))
+
+
+def _turned_outwards(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Faces whose bodies hold a positive volume, but for cavities."""
+    corners = vertices[faces] - vertices[faces].mean((0, 1))
+    volumes = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6  # of tetrahedra below
+    links = coo_array((np.ones(2 * len(faces)), (faces[:, [0, 1]].T.ravel(), faces[:, [1, 2]].T.ravel())))
+    links.resize(len(vertices), len(vertices))
+    count, labels = connected_components(links, directed=False)
+    body = labels[faces[:, 0]]
+    of_body = np.bincount(body, weights=volumes, minlength=count)
+    largest = of_body[np.abs(of_body).argmax()]
+    if abs(largest) <= 1e-12 * float(np.ptp(vertices, axis=0).max()) ** 3:
+        raise ValueError("mesh must enclose a volume, got none")
+    if largest < 0:
+        faces, of_body = faces[:, ::-1], -of_body
+    inside_out = np.flatnonzero(of_body < 0)
+    if len(inside_out) > _MOST_BODIES:
+        raise ValueError(f"mesh must be one or a few bodies, got {len(inside_out)} that are inside out")
+    for index in inside_out:
+        others = faces[(body != index) & (of_body[body] > 0)]
+        if not _within(vertices, faces[body == index][0, 0], others):
+            faces[body == index] = faces[body == index][:, ::-1]
+    return faces
+
+
+def _within(vertices: NDArray[np.float64], index: int, faces: NDArray[np.int64]) -> bool:
+    """Whether a vertex lies inside a closed surface: whether the surface is seen all around it."""
+    corners = vertices[faces] - vertices[index]
+    a, b, c = np.moveaxis(corners / np.linalg.norm(corners, axis=-1, keepdims=True), 1, 0)
+    triple = np.einsum("ni,ni->n", a, np.cross(b, c))
+    cosines = (np.einsum("ni,ni->n", p, q) for p, q in ((a, b), (b, c), (c, a)))
+    return abs(2 * np.arctan2(triple, 1 + sum(cosines)).sum()) > 2 * np.pi  # solid angle (Van Oosterom 1983): 4 pi or 0

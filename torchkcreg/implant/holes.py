@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import networkx
 import numpy as np
 import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 _STEEPEST_TURN = np.deg2rad(50.0)  # between neighbouring faces of a hole's wall
 _FLAT = np.deg2rad(3.0)  # in a bent implant the triangles of a wall's facet are no longer in one plane
@@ -49,13 +51,14 @@ def find_holes(mesh: trimesh.Trimesh, *, smallest_mm: float = 0.75, largest_mm: 
     turn = merged.face_adjacency_angles
     inwards = ~merged.face_adjacency_convex & (turn > 1e-6) & (turn < _STEEPEST_TURN)
     flat = turn < _FLAT
-    graph = networkx.Graph(merged.face_adjacency[inwards].tolist())
     curved = np.zeros(len(merged.faces), bool)
-    curved[list(graph.nodes)] = True
+    curved[merged.face_adjacency[inwards]] = True
     # the triangles of one flat facet of a wall belong together
     within = flat & curved[merged.face_adjacency].any(axis=1)
-    graph.add_edges_from(merged.face_adjacency[within].tolist())
-    holes = [_hole_of(merged, np.fromiter(patch, int)) for patch in networkx.connected_components(graph)]
+    faces = _Faces(merged.triangles, merged.face_normals, merged.area_faces)
+    holes = [
+        _hole_of(faces.of(patch)) for patch in _patches(merged.face_adjacency[inwards | within], len(merged.faces))
+    ]
     found: list[Hole] = []
     for hole in holes:
         if hole is not None and smallest_mm <= hole.radius <= largest_mm:
@@ -74,25 +77,45 @@ def _to_the_surfaces(hole: Hole, vertices: np.ndarray) -> Hole:
     return Hole(hole.center + (low + high) / 2 * hole.axis, hole.axis, hole.radius, float(high - low))
 
 
-def _hole_of(mesh: trimesh.Trimesh, patch: np.ndarray) -> Hole | None:
+class _Faces(NamedTuple):
+    """Corners (n, 3, 3), normals (n, 3) and areas (n,) of faces."""
+
+    triangles: np.ndarray
+    normals: np.ndarray
+    areas: np.ndarray
+
+    def of(self, index: np.ndarray) -> _Faces:
+        """Some of them."""
+        return _Faces(self.triangles[index], self.normals[index], self.areas[index])
+
+
+def _patches(pairs: np.ndarray, count: int) -> list[np.ndarray]:
+    """Indices of the faces of each patch that pairs (m, 2) of neighbours make of ``count`` faces."""
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    labels = connected_components(links, directed=False)[1]
+    linked = np.unique(pairs)
+    order = linked[np.argsort(labels[linked], kind="stable")]
+    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(order) else []
+
+
+def _hole_of(patch: _Faces) -> Hole | None:
     """The hole whose wall is a patch of faces; None if the patch is no wall."""
-    normals, areas = mesh.face_normals[patch], mesh.area_faces[patch]
+    normals, areas = patch.normals, patch.areas
     axis = np.linalg.eigh((normals * areas[:, None]).T @ normals)[1][:, 0]
     wall = np.abs(normals @ axis) < _ALONG_AXIS
     if wall.sum() < 5:
         return None
-    patch, normals, areas = patch[wall], normals[wall], areas[wall]
-    centers = mesh.triangles_center[patch]
+    triangles, normals, areas = patch.of(wall)
+    centers, corners = triangles.mean(1), triangles.reshape(-1, 3)
     across = normals - np.outer(normals @ axis, axis)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     # the point whose distances to the walls' planes spread least: p.n - c.n = -radius
     system = np.column_stack([across, np.ones(len(across))]) * np.sqrt(areas)[:, None]
     system = np.vstack([system, np.append(axis, 0.0) * np.sqrt(areas.sum())])
-    middle = np.median(mesh.vertices[mesh.faces[patch]].reshape(-1, 3) @ axis)
+    middle = np.median(corners @ axis)
     heights = np.einsum("ij,ij->i", centers, across)
     target = np.append(heights * np.sqrt(areas), middle * np.sqrt(areas.sum()))
     solution = np.linalg.lstsq(system, target, rcond=None)[0]
-    corners = mesh.vertices[mesh.faces[patch]].reshape(-1, 3)
     along = corners @ axis
     center = solution[:3] + ((along.min() + along.max()) / 2 - solution[:3] @ axis) * axis
     spokes = corners - center

@@ -11,8 +11,9 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.implant import closed_triangles
+from torchkcreg.implant import closed_mesh
 from torchkcreg.io.files import atomic_path, existing_file
+from torchkcreg.io.stl import load_stl
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".3mf")
 _SMALLEST_MM, _LARGEST_MM = 1.0, 1000.0
@@ -34,7 +35,8 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     if suffix not in MESH_SUFFIXES:
         raise ValueError(f"mesh file {path} must be one of {', '.join(MESH_SUFFIXES)}")
     try:
-        mesh = trimesh.load(str(path), force="mesh", process=True)
+        stl = suffix == ".stl"
+        mesh = load_stl(path.read_bytes()) if stl else trimesh.load(str(path), force="mesh", process=False)
     except Exception as error:  # each of trimesh's parsers fails in its own way
         hint = " (3MF needs the package lxml)" if suffix == ".3mf" and _lacks("lxml") else ""
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -42,12 +44,11 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"mesh file {path} holds no triangles")
     try:
-        triangles = closed_triangles(mesh)
+        closed = closed_mesh(mesh)
     except ValueError as error:
         raise ValueError(f"mesh file {path}: {error}") from error
     if suffix == ".3mf" and mesh.units:  # the one format that says its unit
-        triangles = triangles * trimesh.units.unit_conversion(mesh.units, "millimeters")
-    closed = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=True)
+        closed.apply_scale(trimesh.units.unit_conversion(mesh.units, "millimeters"))
     _warn_about_size(path, closed)
     return closed
 
