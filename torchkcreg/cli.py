@@ -1,4 +1,4 @@
-"""Command line: ``torchkcreg register | warp | evaluate | info | demo``."""
+"""The command line: ``torchkcreg register | warp | evaluate | reconstruct | info | demo``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import torchkcreg
+from torchkcreg.console import one_line, run_command
 
 # Before torch starts its threads: where other programs use the cores too, threads that wait by spinning hold each
 # other up, and a registration takes ten times as long.
@@ -30,35 +31,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
     except SystemExit as done:  # argparse is done after --help, --version, or a wrong flag
         return int(done.code or 0)
-    name = f"torchkcreg {options.command}"
-
-    def show(message: Warning | str, *_: object, **__: object) -> None:
-        print(f"{name}: warning: {_one_line(message)}", file=sys.stderr)
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = show
-            status = options.run(options)
-    except (ValueError, OSError) as error:
-        print(f"{name}: error: {_one_line(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"{name}: interrupted", file=sys.stderr)
-        return 130
-    return status or 0
-
-
-def _one_line(message: Exception | str) -> str:
-    return " ".join(str(message).split())
+    return run_command(f"torchkcreg {options.command}", lambda: options.run(options), debug=options.debug)
 
 
 class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, like all the others."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {_one_line(message)}\n")
+        self.exit(2, f"{self.prog}: error: {one_line(message)}\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -77,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
 def _command(commands, name: str, run, text: str) -> argparse.ArgumentParser:
     command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     command.set_defaults(run=run)
+    command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return command
 
 
@@ -97,7 +78,7 @@ def _add_register(commands) -> None:
     command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
     command.add_argument("--seed", type=int, help="seed of the random numbers")
     command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
-    command.add_argument("--backend", help="projector: auto, cpp, triton or torch")
+    command.add_argument("--backend", help="projector: auto, cpp or torch")
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
     existing = command.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
@@ -234,13 +215,16 @@ def _reconstruct(options: argparse.Namespace) -> None:
 def _add_info(commands) -> None:
     command = _command(commands, "info", _info, "say what a file or a run folder holds, or what is installed")
     command.add_argument("paths", type=Path, nargs="*", help="meshes, geometries, projections, run folders")
+    command.add_argument("--open-beam", type=float, help="unattenuated intensity, where projections do not say it")
 
 
 def _info(options: argparse.Namespace) -> None:
     from torchkcreg.experiments import describe, describe_installation
 
-    for line in [describe_installation()] if not options.paths else map(describe, options.paths):
-        print(line)
+    if not options.paths:
+        print(describe_installation())
+    for path in options.paths:
+        print(describe(path, open_beam=options.open_beam))
 
 
 def _add_demo(commands) -> None:

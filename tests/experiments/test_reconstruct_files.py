@@ -152,7 +152,7 @@ def test_wrong_input_is_one_line_that_names_it(ball_scan, small_run, tmp_path, c
     assert main(arguments(ball_scan, tmp_path / "a", "--method", "kcrec")) == 2
     assert "needs the run of a registration" in capsys.readouterr().err
     assert main(["reconstruct", "--run", str(small_run), "--out", str(tmp_path / "b"), "--scatter", "none"]) == 2
-    assert "needs at least 3 views" in capsys.readouterr().err or not (tmp_path / "b" / "volume.mha").exists()
+    assert "needs at least 3 views" in capsys.readouterr().err
     assert main(arguments(ball_scan, tmp_path / "c", "--size", 10, -1, 10)) == 2
     assert "size_mm must be positive" in capsys.readouterr().err
     assert main(["reconstruct", "--out", str(tmp_path / "d")]) == 2

@@ -142,7 +142,7 @@ IMAGE = np.ones((2, 3, 4))
         ({"intensity": IMAGE, "open_beam": np.ones((5,))}, "open_beam must broadcast"),
         ({"intensity": IMAGE, "open_beam": np.ones((1, 2, 3, 4))}, "open_beam must broadcast"),
         ({"intensity": IMAGE, "open_beam": 1.0, "saturation": -1}, "saturation must be positive"),
-        ({"line_integrals": IMAGE, "mask": IMAGE[:1]}, "mask must have the shape"),
+        ({"line_integrals": IMAGE, "mask": IMAGE[:1]}, "mask must be numbers of the shape"),
         ({"line_integrals": np.array([[["a"]]], dtype=object)}, "cannot be read"),
     ],
 )

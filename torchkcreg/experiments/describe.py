@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -28,11 +29,12 @@ def describe_installation() -> str:
     return "\n".join([*lines, f"projector backend {backend} ({why})"])
 
 
-def describe(path: Path) -> str:
+def describe(path: Path, *, open_beam: float | None = None) -> str:
     """What a mesh, a geometry, projections or a run folder holds.
 
     Args:
         path: A run folder, a mesh (STL, OBJ, PLY, OFF, 3MF), a geometry (JSON) or projections (NPZ, NPY, MHA, ...).
+        open_beam: Unattenuated intensity, where projections do not say it.
 
     Raises:
         FileNotFoundError: If nothing is there, or the run in the folder is not finished.
@@ -42,7 +44,7 @@ def describe(path: Path) -> str:
     readers: dict[tuple[str, ...], Callable[[Path], str]] = {
         _MESHES: _mesh,
         (".json",): _geometry,
-        _IMAGES: _projections,
+        _IMAGES: partial(_projections, open_beam=open_beam),
     }
     if path.is_dir():
         return f"{path}: {_run(path)}"
@@ -91,8 +93,8 @@ def _range(low: float, high: float) -> str:
     return f"{low:.4g}" if high - low < 1e-4 * high else f"{low:.4g} to {high:.4g}"
 
 
-def _projections(path: Path) -> str:
-    projections = read_projections(path)
+def _projections(path: Path, *, open_beam: float | None) -> str:
+    projections = read_projections(path, open_beam=open_beam)
     views, rows, cols = projections.line_integrals.shape
     values = projections.line_integrals[projections.mask]
     span = f"line integrals {values.min():.3g} to {values.max():.3g}" if len(values) else "no valid pixel"

@@ -12,8 +12,10 @@ import torch
 import trimesh
 from torch import Tensor
 
+from torchkcreg.geometry import transform_points
 from torchkcreg.implant import Component, Hole, ImplantPointCloud, find_holes
 from torchkcreg.io import (
+    implausible_magnification,
     read_components,
     read_geometry,
     read_init,
@@ -99,6 +101,9 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
         ]
         implant = ImplantPointCloud.from_mesh(mesh, config.pitch_mm)
         holes = find_holes(mesh)
+        placed = implant.points if pose is None else transform_points(pose, implant.points.double())
+        if (doubt := implausible_magnification(data.facing(placed).geometry, placed)) is not None:
+            warnings.warn(doubt, stacklevel=2)
     return RegistrationInputs(implant, data, components, holes, spectrum, pose, notes)
 
 
@@ -124,10 +129,8 @@ def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> Registra
             else projections.select(files.views)
         )
         geometry = geometry.select(files.views)
-    if projections.num_masked:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in projections.num_masked.items())
-        total = sum(projections.num_masked.values())
-        warnings.warn(f"projections file {files.projections}: {total} pixels are masked ({reasons})", stacklevel=2)
+    if (note := projections.masked_note()) is not None:
+        warnings.warn(f"projections file {files.projections}: {note}", stacklevel=2)
     largest = max(stage.bin for stage in config.schedule())
     if min(geometry.det_shape) < _FEWEST_PIXELS * largest:
         rows, cols = geometry.det_shape

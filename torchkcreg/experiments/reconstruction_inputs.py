@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,6 +19,7 @@ from torchkcreg.reconstruction import (
     KnownComponent,
     Veil,
     field_of_view_grid,
+    filled,
     fit_veil,
     known_materials,
 )
@@ -102,7 +104,7 @@ class ReconstructionInputs:
 
     Attributes:
         geometry: All views.
-        transmission: Measured intensity over the open beam's, (V, rows, cols).
+        transmission: Measured intensity over the open beam's, (V, rows, cols); masked pixels filled.
         mask: 0 where a pixel holds no measurement.
         grid: The voxels.
         beam: Energies and the metals' attenuation.
@@ -137,7 +139,9 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         if files.run is None:
             raise ValueError("method kcrec needs the run of a registration: name it with --run")
         components = registered_components(files.run, components=files.components, material=options.material)
-    transmission = torch.exp(-projections.line_integrals)
+    if (note := projections.masked_note()) is not None:
+        warnings.warn(f"projections file {files.projections}: {note}", stacklevel=2)
+    transmission = torch.exp(-filled(projections.line_integrals, projections.mask))
     return ReconstructionInputs(
         geometry,
         transmission,

@@ -11,6 +11,7 @@ from .files import read_json, write_json
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .init import read_init, write_init
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
+from .plausible import implausible_magnification
 from .points import read_points, write_points
 from .projections import Projections, read_projections, write_projections
 from .references import read_reference
@@ -28,6 +29,7 @@ __all__ = [
     "displacement_field",
     "geometry_from_dict",
     "geometry_to_dict",
+    "implausible_magnification",
     "itk_transform",
     "read_components",
     "read_config",

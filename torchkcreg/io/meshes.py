@@ -16,7 +16,7 @@ from torchkcreg.io.files import atomic_path, existing_file
 from torchkcreg.io.stl import load_stl
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".3mf")
-_SMALLEST_MM, _LARGEST_MM = 1.0, 1000.0
+_METRES_MM, _SMALLEST_MM, _LARGEST_MM = 1.0, 20.0, 1000.0
 
 
 def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
@@ -24,7 +24,8 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
 
     3MF says its unit and is converted (it needs the package lxml); the others are taken to be in mm.
     Equal vertices are merged, faces that this collapses dropped; several bodies in one file are one surface. A largest
-    extent under 1 mm or over 1000 mm gives a warning: the file is probably in metres, or not in mm.
+    extent under 1, under 20 or over 1000 mm gives a warning: the file is probably in metres, in cm or inches, or not in
+    mm.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -98,8 +99,10 @@ def write_point_cloud_ply(path: str | os.PathLike[str], points: Tensor, displace
 
 def _warn_about_size(path: Path, mesh: trimesh.Trimesh) -> None:
     extents = " x ".join(f"{e:.4g}" for e in mesh.extents)
-    if mesh.extents.max() < _SMALLEST_MM:
+    if mesh.extents.max() < _METRES_MM:
         warnings.warn(f"mesh file {path} is {extents} mm: it is probably in metres", stacklevel=3)
+    elif mesh.extents.max() < _SMALLEST_MM:
+        warnings.warn(f"mesh file {path} is {extents} mm, small for an implant: is it in cm or inches?", stacklevel=3)
     elif mesh.extents.max() > _LARGEST_MM:
         warnings.warn(f"mesh file {path} is {extents} mm: it is probably not in mm", stacklevel=3)
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import zipfile
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,12 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.io.files import atomic_path, existing_file
+from torchkcreg.io.plausible import ImageHeader, implausible_images, stuck_pixels
 from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
 
 IMAGE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nii", ".nii.gz", ".tif", ".tiff")
 RELATIVE_FLOOR = 1e-6
+_ARRAYS = ("intensity", "open_beam", "line_integrals", "mask", "saturation")
 DETECTOR_CEILINGS = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 16))
 
 
@@ -31,27 +33,41 @@ class Projections:
         line_integrals: float32 (V, rows, cols), finite everywhere (masked pixels hold a stand-in).
         mask: bool (V, rows, cols), True where a pixel counts.
         num_masked: how many pixels do not count, by reason: "not finite", "not positive" (intensities at or below
-            zero), "in the file's mask". Reasons that never occurred are left out.
+            zero), "in the file's mask", "stuck at the ceiling". Reasons that never occurred are left out.
         num_saturated: pixels at the detector's ceiling; they count (see `read_projections`).
+        header: what the file says of pixels and axes; None where it says nothing.
     """
 
     line_integrals: Tensor
     mask: Tensor
     num_masked: dict[str, int] = field(default_factory=dict)
     num_saturated: int = 0
+    header: ImageHeader | None = None
 
     def select(self, views: Sequence[int]) -> Projections:
         """The given views alone, in the given order; the counts stay those of the whole."""
         _check_views(views, len(self.line_integrals))
         index = list(views)
-        return Projections(self.line_integrals[index], self.mask[index], self.num_masked, self.num_saturated)
+        return replace(self, line_integrals=self.line_integrals[index], mask=self.mask[index])
+
+    def masked_note(self) -> str | None:
+        """How many pixels do not count, and why, in words; None where all do."""
+        if not self.num_masked:
+            return None
+        reasons = ", ".join(f"{count} {reason}" for reason, count in self.num_masked.items())
+        return f"{sum(self.num_masked.values())} pixels are masked ({reasons})"
 
     def check_against(self, geometry: ConeBeamGeometry) -> None:
-        """Nothing; ValueError when the geometry has another number of views or another detector."""
+        """Nothing; ValueError when the geometry has another number of views or another detector.
+
+        A header whose pixels or axes contradict the geometry gives a warning.
+        """
         have = tuple(self.line_integrals.shape)
         want = (geometry.num_views, *(int(n) for n in geometry.det_shape))
         if have != want:
             raise ValueError(f"projections have (views, rows, cols) = {have}, the geometry has {want}")
+        if self.header is not None:
+            self.header.check_against(geometry)
 
 
 def read_projections(
@@ -72,7 +88,8 @@ def read_projections(
     is taken at its word, half a count of an integer image and a millionth of the open beam otherwise; not finite line
     integrals by 0. A *saturated*
     pixel says that its line integral is at most the ceiling's: it keeps that value and counts, because masking the
-    open beam would cut the outline of the limb out of every view; such pixels are flat and pull at nothing.
+    open beam would cut the outline of the limb out of every view; such pixels are flat and pull at nothing. Those that
+    stand alone at the ceiling in every view are the detector's, not the beam's: they are masked.
 
     Args:
         path: the file.
@@ -88,10 +105,14 @@ def read_projections(
     """
     path = existing_file(path, "projections")
     try:
-        arrays = _load(path)
-        return _convert(arrays, open_beam, saturation, views)
+        arrays, header = _load(path)
+        projections = _convert(arrays, open_beam, saturation, views)
+        doubts = implausible_images(projections.line_integrals, projections.mask)
     except ValueError as error:
         raise ValueError(f"projections file {path}: {error}") from error
+    for doubt in doubts:
+        warnings.warn(f"projections file {path}: {doubt}", stacklevel=2)
+    return replace(projections, header=header)
 
 
 def write_projections(
@@ -116,19 +137,22 @@ def write_projections(
         np.savez_compressed(stream, allow_pickle=False, **arrays)  # type: ignore[arg-type]
 
 
-def _load(path: Path) -> dict[str, NDArray]:
+def _load(path: Path) -> tuple[dict[str, NDArray], ImageHeader | None]:
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".npy") and not path.name.lower().endswith(IMAGE_SUFFIXES):
         raise ValueError(f"projections are .npz, .npy, {', '.join(IMAGE_SUFFIXES)}, not {suffix or 'without a suffix'}")
     try:
         if suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                wanted = ("intensity", "open_beam", "line_integrals", "mask", "saturation")
-                return {key: file[key] for key in wanted if key in file.files}
+            loaded = np.load(path, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):  # an array under an archive's name
+                return {"image": loaded}, None
+            with loaded as file:
+                return {key: file[key] for key in _ARRAYS if key in file.files}, None
         if suffix == ".npy":
-            return {"image": np.load(path, allow_pickle=False)}
-        return {"image": sitk.GetArrayFromImage(sitk.ReadImage(str(path)))}
-    except (OSError, EOFError, RuntimeError, ValueError, zipfile.BadZipFile) as error:
+            return {"image": np.asarray(np.load(path, allow_pickle=False))}, None
+        image = sitk.ReadImage(str(path))
+        return {"image": sitk.GetArrayFromImage(image)}, ImageHeader.of(image)
+    except Exception as error:  # NumPy, zip archives and ITK's readers fail in many ways, and each means a damaged file
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         raise ValueError(f"cannot be read: {reason[0]}") from error
 
@@ -145,9 +169,10 @@ def _convert(
     image = arrays[kind]
     if image.ndim != 3 or 0 in image.shape or image.dtype.kind not in "uif":
         raise ValueError(f"{kind} must be numbers of shape (V, rows, cols), got {image.dtype} {image.shape}")
-    mask = np.broadcast_to(True, image.shape) if "mask" not in arrays else arrays["mask"] != 0
-    if mask.shape != image.shape:
-        raise ValueError(f"mask must have the shape {image.shape} of {kind}, got {mask.shape}")
+    kept = arrays.get("mask", np.broadcast_to(True, image.shape))
+    if kept.shape != image.shape or kept.dtype.kind not in "buif":
+        raise ValueError(f"mask must be numbers of the shape {image.shape} of {kind}, got {kept.dtype} {kept.shape}")
+    mask = kept != 0
     beam = None if beam is None else _open_beam(beam, image.shape)
     if views is not None:
         _check_views(views, len(image))
@@ -159,7 +184,10 @@ def _convert(
     if beam is None:
         raise ValueError("has intensity but no open_beam, the intensity without an object: give it")
     if saturation is None and "saturation" in arrays:
-        saturation = float(arrays["saturation"])
+        said = arrays["saturation"]
+        if said.size != 1 or said.dtype.kind not in "uif":
+            raise ValueError(f"saturation must be one number, got {said.dtype} {said.shape}")
+        saturation = float(said.reshape(()))
     return _from_intensity(image, mask, beam, saturation)
 
 
@@ -186,7 +214,11 @@ def _from_intensity(image: NDArray, mask: NDArray, beam: NDArray, saturation: fl
     )
     keep = valid & torch.from_numpy(finite & positive & mask)
     line_integrals = torch.where(torch.isfinite(line_integrals), line_integrals, 0.0).float()
-    return Projections(line_integrals, keep, _counts(finite, positive, mask), int(saturated.sum()))
+    reasons = _counts(finite, positive, mask)
+    if ceiling is not None and (stuck := stuck_pixels(image, saturated, float(ceiling))).any():
+        reasons["stuck at the ceiling"] = int((stuck & keep.numpy()).sum())
+        keep = keep & ~torch.from_numpy(stuck)
+    return Projections(line_integrals, keep, reasons, int(saturated.sum()))
 
 
 def _counts(finite: NDArray, positive: NDArray, mask: NDArray) -> dict[str, int]:

@@ -6,6 +6,7 @@ into line integrals and weights, with known components (KC-Rec), scatter and bea
 
 from .corrections import Veil, fit_veil, floored_line_integrals, refined_scatter, veil_image
 from .ct_numbers import hounsfield
+from .dead_pixels import filled
 from .fdk import FDKConfig, fdk
 from .field_of_view import coverage, field_of_view_grid
 from .known_component import (
@@ -48,6 +49,7 @@ __all__ = [
     "coverage",
     "fdk",
     "field_of_view_grid",
+    "filled",
     "fit_veil",
     "floored_line_integrals",
     "hounsfield",

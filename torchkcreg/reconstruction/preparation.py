@@ -11,6 +11,7 @@ from torch import Tensor
 from torchkcreg.geometry import ConeBeamGeometry
 
 from .corrections import Veil, floored_line_integrals, veil_image
+from .dead_pixels import filled_transmission
 from .known_component import KnownComponent, component_shares, without_components
 from .spectral import BeamModel
 from .weights import statistical_weights
@@ -58,7 +59,7 @@ def prepare(
         components: metal in its registered place.
         shares: `component_shares` of these, where they are at hand already or come from a projector of the user's own.
         scatter: a fitted or given veil, or an image of the scatter in units of the open beam.
-        mask: 0 where a pixel holds no measurement.
+        mask: 0 where a pixel holds no measurement: it is filled from its neighbours, see `filled`, and has no weight.
         floor: smallest transmission taken at its word.
         noise: see `statistical_weights`.
         blur_sigma_px: the system's blur for the components' projections, detector pixels.
@@ -73,6 +74,8 @@ def prepare(
     (0.6931, 0.5)
     """
     expected = (geometry.num_views, *geometry.det_shape)
+    if mask is not None:
+        transmission = filled_transmission(transmission, mask)
     if tuple(transmission.shape) != expected or not bool(transmission.isfinite().all()):
         raise ValueError(f"transmission must be finite numbers of shape {expected}, got {tuple(transmission.shape)}")
     if isinstance(scatter, Veil):

@@ -155,7 +155,7 @@ class RegistrationConfig(BaseModel):
         screw_materials: What they may be made of, besides the implant's own material.
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
-        backend: Projector: "auto", "cpp", "triton" or "torch".
+        backend: Projector: "auto", "cpp" or "torch".
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -180,7 +180,7 @@ class RegistrationConfig(BaseModel):
     screw_materials: tuple[str, ...] = ("steel", "titanium")
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
-    backend: Literal["auto", "cpp", "triton", "torch"] = "auto"
+    backend: Literal["auto", "cpp", "torch"] = "auto"
 
     @field_validator("stages")
     @classmethod

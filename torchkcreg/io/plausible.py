@@ -1,0 +1,102 @@
+"""Whether images can be what they are said to be: stuck pixels, raw counts, repeated views, headers that contradict."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import SimpleITK as sitk
+from numpy.typing import NDArray
+from scipy.ndimage import binary_opening, median_filter
+from torch import Tensor
+
+from torchkcreg.geometry import ConeBeamGeometry
+
+_RAW = 20.0  # a median line integral of this much lets a billionth of the beam through
+_BRIGHT = -0.7  # a median line integral below this: twice the open beam, more than scatter adds
+_MAGNIFICATION = (1.0, 8.0)
+_ALONE = 0.7  # of the ceiling, which the neighbours of a stuck pixel stay below
+_SPACING = 0.01  # relative
+
+
+def implausible_images(line_integrals: Tensor, mask: Tensor) -> list[str]:
+    """What is doubtful about line integrals (V, rows, cols), a line each.
+
+    Raises:
+        ValueError: They are certainly something else.
+    """
+    values = line_integrals[mask]
+    if len(values) == 0:
+        return []
+    median = float(values[:: max(1, len(values) // 1_000_000)].median())
+    if median > _RAW:
+        raise ValueError(f"line integrals have a median of {median:.4g}: they are intensities, give their open_beam")
+    doubts = []
+    if median < _BRIGHT:
+        doubts.append(
+            f"most pixels are much brighter than the open beam (median line integral {median:.2g}): is it right?"
+        )
+    same = [view for view in range(1, len(mask)) if bool((line_integrals[view] == line_integrals[view - 1]).all())]
+    if same and float(values.max()) > float(values.min()):
+        doubts.append(f"view {same[0]} is the same image as view {same[0] - 1}: is each view there once?")
+    return doubts
+
+
+def stuck_pixels(image: NDArray, saturated: NDArray[np.bool_], ceiling: float) -> NDArray[np.bool_]:
+    """Pixels (V, rows, cols) that stand at the ceiling by themselves in every view: the detector's fault.
+
+    A region of open beam is wide, or moves from view to view; a single view cannot tell.
+    """
+    always = saturated.all(0)
+    if len(image) < 2 or not always.any():
+        return np.zeros_like(saturated)
+    thin = always & ~binary_opening(always, np.ones((3, 3)))
+    dark = [median_filter(view.astype(np.float32), 5) < _ALONE * ceiling for view in image] if thin.any() else [thin]
+    return np.broadcast_to(thin & np.all(dark, axis=0), saturated.shape).copy()
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What an image file says of its pixels.
+
+    Attributes:
+        spacing: (dv, du) in mm.
+        turned: Whether its axes run other than from the first pixel on.
+    """
+
+    spacing: tuple[float, float]
+    turned: bool
+
+    @classmethod
+    def of(cls, image: sitk.Image) -> ImageHeader | None:
+        """The header of a stack of views; None where it is the default, which says nothing."""
+        du, dv = image.GetSpacing()[:2]
+        size = image.GetDimension()
+        turned = not np.allclose(np.reshape(image.GetDirection(), (size, size)), np.eye(size), atol=1e-3)
+        return None if du == dv == 1.0 and not turned else cls((dv, du), turned)
+
+    def check_against(self, geometry: ConeBeamGeometry) -> None:
+        """Nothing; warns where a geometry has other pixels, or axes that may run the other way."""
+        expected = geometry.pixel_spacing
+        if self.spacing != (1.0, 1.0) and not np.allclose(self.spacing, expected, rtol=_SPACING):
+            said, want = (" x ".join(f"{d:.4g}" for d in spacing) for spacing in (self.spacing, expected))
+            warnings.warn(f"the images' header says pixels of {said} mm, the geometry {want} mm", stacklevel=3)
+        if self.turned:
+            warnings.warn(
+                "the images' header turns their axes; pixels are taken as they are stored, row 0 with the smallest v",
+                stacklevel=3,
+            )
+
+
+def implausible_magnification(geometry: ConeBeamGeometry, points: Tensor) -> str | None:
+    """What is doubtful about where an object (N, 3) stands between source and detector; None if nothing is."""
+    depth = geometry.project(points.double())[1].median(-1).values
+    ratios = (geometry.detector_distances / depth).tolist()
+    view = max(range(len(ratios)), key=lambda i: ratios[i])
+    if min(ratios) < _MAGNIFICATION[0]:
+        view = min(range(len(ratios)), key=lambda i: ratios[i])
+        return f"the object would stand behind the detector in view {view}: do pixel spacing and matrices fit, in mm?"
+    if ratios[view] > _MAGNIFICATION[1]:
+        return f"the object would be magnified {ratios[view]:.1f} times in view {view}: are matrices and mesh in mm?"
+    return None
