@@ -6,6 +6,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "torchkcreg"
 FLOORS = {
     "console": 0,
+    "differentiable": 0,
+    "precision": 0,
     "geometry": 1,
     "physics": 1,
     "similarity": 1,
@@ -53,7 +55,7 @@ def test_the_floors_are_seen_to_be_used():
     assert "projector" in imports_of(PACKAGE / "projector" / "point_cloud.py")
 
 
-@pytest.mark.parametrize("folder", [*FOLDERS, "console", "cli"])
+@pytest.mark.parametrize("folder", [*FOLDERS, "console", "differentiable", "precision", "cli"])
 def test_a_folder_imports_only_from_lower_floors_and_knows_none_on_its_own(folder):
     files = sorted((PACKAGE / folder).rglob("*.py")) or [PACKAGE / f"{folder}.py"]
     assert files

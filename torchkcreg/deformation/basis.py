@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchkcreg.deformation.bspline import bspline_pieces
 from torchkcreg.deformation.grid import ControlPointGrid
+from torchkcreg.differentiable import one_by_one
 
 _POINTS_PER_BLOCK = 1024  # (64, 1024) weights stay in a core's cache
 _Orders = tuple[int, int, int]
@@ -88,14 +89,33 @@ class SplineBasis:
 
 class _Evaluate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, eta: Tensor, features: Tensor, blocks: _Blocks, orders: _Orders) -> Tensor:
-        ctx.save_for_backward(eta, features)
-        ctx.blocks, ctx.orders = blocks, orders
+    def forward(eta: Tensor, features: Tensor, blocks: _Blocks, orders: _Orders) -> Tensor:
         weights, size = _Workspace(eta, orders), features.shape[-1]
         out, block = features.new_empty(len(eta), size), features.new_empty(_POINTS_PER_BLOCK, size)
         for cell, rows in blocks:
             out.index_copy_(0, rows, torch.mm(weights(rows).T, features[cell], out=block[: len(rows)]))
         return out
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        eta, features, ctx.blocks, ctx.orders = inputs
+        ctx.save_for_backward(eta, features)
+        ctx.save_for_forward(eta, features)
+
+    @staticmethod
+    def jvp(ctx: Any, along: Tensor | None, tangent: Tensor | None, *_: None) -> Tensor:
+        eta, features = ctx.saved_tensors
+        total = torch.zeros((), dtype=features.dtype)
+        if tangent is not None:
+            total = total + _Evaluate.apply(eta, tangent, ctx.blocks, ctx.orders)
+        if along is not None:
+            slopes = [_Evaluate.apply(eta, features, ctx.blocks, o) for o in _steeper(ctx.orders)]
+            total = total + sum(along[:, a : a + 1] * slope for a, slope in enumerate(slopes))
+        return total
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *inputs: Any) -> tuple:
+        return one_by_one(_Evaluate.apply, info, in_dims, inputs)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
@@ -109,14 +129,33 @@ class _Evaluate(torch.autograd.Function):
 
 class _Scatter(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, eta: Tensor, values: Tensor, blocks: _Blocks, orders: _Orders, num_cells: int) -> Tensor:
-        ctx.save_for_backward(eta, values)
-        ctx.blocks, ctx.orders = blocks, orders
+    def forward(eta: Tensor, values: Tensor, blocks: _Blocks, orders: _Orders, num_cells: int) -> Tensor:
         out = values.new_zeros(num_cells, 64, values.shape[-1])
         weights = _Workspace(eta, orders)
         for cell, rows in blocks:
             out[cell].addmm_(weights(rows), values[rows])
         return out
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        eta, values, ctx.blocks, ctx.orders, ctx.num_cells = inputs
+        ctx.save_for_backward(eta, values)
+        ctx.save_for_forward(eta, values)
+
+    @staticmethod
+    def jvp(ctx: Any, along: Tensor | None, tangent: Tensor | None, *_: None) -> Tensor:
+        eta, values = ctx.saved_tensors
+        total = torch.zeros((), dtype=values.dtype)
+        if tangent is not None:
+            total = total + _Scatter.apply(eta, tangent, ctx.blocks, ctx.orders, ctx.num_cells)
+        if along is not None:
+            for a, orders in enumerate(_steeper(ctx.orders)):
+                total = total + _Scatter.apply(eta, along[:, a : a + 1] * values, ctx.blocks, orders, ctx.num_cells)
+        return total
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *inputs: Any) -> tuple:
+        return one_by_one(_Scatter.apply, info, in_dims, inputs)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
@@ -130,8 +169,14 @@ class _Scatter(torch.autograd.Function):
 
 def _slope(eta: Tensor, features: Tensor, values: Tensor, ctx: Any) -> Tensor:
     """Gradient (N, 3) by eta of ``sum_n values_n . spline(x_n)``: derivatives are splines again."""
-    steeper = [tuple(o + (a == axis) for a, o in enumerate(ctx.orders)) for axis in range(3)]
-    return torch.stack([(values * _Evaluate.apply(eta, features, ctx.blocks, o)).sum(-1) for o in steeper], dim=-1)
+    slopes = (_Evaluate.apply(eta, features, ctx.blocks, o) for o in _steeper(ctx.orders))
+    return torch.stack([(values * slope).sum(-1) for slope in slopes], dim=-1)
+
+
+def _steeper(orders: _Orders) -> list[_Orders]:
+    """Orders of the derivatives along each axis."""
+    x, y, z = orders
+    return [(x + 1, y, z), (x, y + 1, z), (x, y, z + 1)]
 
 
 class _Workspace:

@@ -51,6 +51,18 @@ def convolve(images: Tensor, kernel: list[float], dim: int) -> Tensor:
     return result
 
 
+def convolve_by(images: Tensor, kernel: Tensor, dim: int) -> Tensor:
+    """`convolve` of each candidate (K, V, rows, cols) by its own kernel (K, odd); differentiable in both, any order."""
+    radius, size = kernel.shape[-1] // 2, images.shape[dim]
+    steps = torch.arange(size + 2 * radius, device=images.device).sub(radius).clamp(0, size - 1)
+    padded = images.index_select(dim, steps)
+    shares = kernel[:, None, None, None, :]
+    result = torch.zeros_like(images)
+    for offset in range(2 * radius + 1):
+        result = result + padded.narrow(dim, offset, size) * shares[..., offset]
+    return result
+
+
 def convolve_adjoint(images: Tensor, kernel: list[float], dim: int) -> Tensor:
     """The adjoint of `convolve`: `<convolve(x), y> = <x, convolve_adjoint(y)>`."""
     radius, size = len(kernel) // 2, images.shape[dim]

@@ -13,6 +13,7 @@ from torchkcreg.physics.materials import Material, material
 from torchkcreg.physics.scatter import scattered_signal
 from torchkcreg.physics.spectra import Spectrum
 from torchkcreg.physics.transmission import polyenergetic_line_integrals
+from torchkcreg.precision import full_precision
 
 
 class IdentityIntensity(nn.Module):
@@ -100,6 +101,7 @@ class PolyenergeticTransmission(nn.Module):
         self.register_buffer("attenuation", torch.stack([m.attenuation(kept.energies_kev) for m in materials]))
         self.register_buffer("aluminium", material("aluminium").attenuation(kept.energies_kev))
 
+    @full_precision
     def forward(
         self,
         path_lengths: Tensor,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import avg_pool2d
 
-from torchkcreg.physics.blur import convolve, convolve_adjoint, kernel_gradient
+from torchkcreg.differentiable import differentiable
+from torchkcreg.physics.blur import convolve, convolve_adjoint, convolve_by, kernel_gradient
 
 BLOCK_PIXELS = 65536  # exponentials are taken in blocks that stay in a core's cache
 
@@ -36,46 +37,38 @@ def polyenergetic_line_integrals(
         pooling: Blurred transmissions are averaged over squares of this many pixels a side, which divides the images.
 
     Returns:
-        Differentiable once, in everything but the attenuation.
+        Differentiable in everything but the attenuation: gradients by formulas of their own, all other derivatives by
+        those of plain torch, which keep an image for each energy.
     """
     num_candidates, _, views, rows, cols = path_lengths.shape
     spread = scatter.to(path_lengths).expand(num_candidates, views, rows // pooling, cols // pooling)
-    return _PolyenergeticLineIntegrals.apply(path_lengths, attenuation, weights, kernel, spread, pooling)
+    inputs = (path_lengths, weights, kernel, spread)
+    return differentiable(_LineIntegrals(attenuation.detach(), pooling), *inputs)
 
 
-class _PolyenergeticLineIntegrals(torch.autograd.Function):
+@dataclass(frozen=True)
+class _LineIntegrals:
     """See `polyenergetic_line_integrals`."""
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        path_lengths: Tensor,
-        attenuation: Tensor,
-        weights: Tensor,
-        kernel: Tensor,
-        scatter: Tensor,
-        pooling: int,
-    ) -> Tensor:
-        ctx.save_for_backward(path_lengths, attenuation, weights, kernel, scatter)
-        ctx.pooling = pooling
-        coefficients = attenuation.tolist()
+    attenuation: Tensor
+    pooling: int
+
+    def forward(self, path_lengths: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor) -> Tensor:
+        coefficients = self.attenuation.tolist()
         image_shape = path_lengths.shape[2:]
         result = path_lengths.new_empty(scatter.shape)
         for candidate, (shares, blur) in enumerate(zip(weights.tolist(), kernel.tolist())):
             lengths = path_lengths[candidate].flatten(1)
             signal = transmitted(lengths, coefficients, shares).view(image_shape)
             for view in range(image_shape[0]):
-                blurred = _pooled(convolve(convolve(signal[view], blur, -2), blur, -1), pooling)
-                out = result[candidate, view]
-                _add_floor(blurred, scatter[candidate, view], out=out).log_().neg_()
+                blurred = _pooled(convolve(convolve(signal[view], blur, -2), blur, -1), self.pooling)
+                _add_floor(blurred, scatter[candidate, view], out=result[candidate, view]).log_().neg_()
         return result
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        path_lengths, attenuation, weights, kernel, scatter = ctx.saved_tensors
-        coefficients = attenuation.tolist()
-        wants_lengths, _, wants_weights, wants_kernel, wants_scatter, _ = ctx.needs_input_grad
+    def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
+        path_lengths, weights, kernel, scatter = inputs
+        coefficients = self.attenuation.tolist()
+        wants_lengths, wants_weights, wants_kernel, wants_scatter = needed
         grad_lengths = torch.empty_like(path_lengths) if wants_lengths else None
         grad_scatter = torch.empty(scatter.shape).to(scatter) if wants_scatter else None
         grad_weights, grad_kernel = [], []
@@ -83,12 +76,12 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
             lengths = path_lengths[candidate].flatten(1)
             signal = transmitted(lengths, coefficients, shares).view(path_lengths.shape[2:])
             along_rows = convolve(signal, blur, -2)
-            blurred = _pooled(convolve(along_rows, blur, -1), ctx.pooling)
+            blurred = _pooled(convolve(along_rows, blur, -1), self.pooling)
             total = _add_floor(blurred, scatter[candidate], out=blurred)
-            grad_signal = total.reciprocal_().mul_(upstream[candidate]).neg_()
+            grad_signal = total.reciprocal_().mul_(gradient[candidate]).neg_()
             if grad_scatter is not None:
                 grad_scatter[candidate] = grad_signal
-            grad_signal = _spread(grad_signal, ctx.pooling)
+            grad_signal = _spread(grad_signal, self.pooling)
             grad_rows = convolve_adjoint(grad_signal, blur, -1)
             if wants_kernel:
                 radius = len(blur) // 2
@@ -98,14 +91,19 @@ class _PolyenergeticLineIntegrals(torch.autograd.Function):
             grad_signal = convolve_adjoint(grad_rows, blur, -2).flatten()
             out = grad_lengths[candidate].flatten(1) if grad_lengths is not None else None
             grad_weights.append(_transmission_gradient(lengths, coefficients, shares, grad_signal, out))
-        return (
+        return [
             grad_lengths,
-            None,
             weights.new_tensor(grad_weights) if wants_weights else None,
             kernel.new_tensor(grad_kernel) if wants_kernel else None,
             grad_scatter,
-            None,
-        )
+        ]
+
+    def reference(self, path_lengths: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor) -> Tensor:
+        exponents = torch.einsum("me,kmvij->kevij", self.attenuation.to(path_lengths), path_lengths)
+        signal = torch.einsum("ke,kevij->kvij", weights.to(path_lengths), torch.exp(-exponents))
+        blurred = convolve_by(convolve_by(signal, kernel.to(signal), -2), kernel.to(signal), -1)
+        floor = torch.finfo(signal.dtype).tiny
+        return -torch.log((avg_pool2d(blurred, self.pooling) + scatter).clamp_min(floor))
 
 
 def transmitted(lengths: Tensor, attenuation: list[list[float]], weights: list[float]) -> Tensor:

@@ -8,10 +8,14 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from torchkcreg.differentiable import is_transformed
+from torchkcreg.precision import full_precision
+
 MAX_PAIRS = 1 << 20  # (triangle, pixel) pairs looked at together
 MAX_CLIPPED_PAIRS = 1 << 14  # pairs clipped together: what they need stays in a core's cache
 
 
+@full_precision
 def project_mesh(vertices: Tensor, faces: Tensor, projection_matrices: Tensor, det_shape: tuple[int, int]) -> Tensor:
     """Path lengths in mm through a closed mesh, `(..., V, rows, cols)`, each the average over its pixel.
 
@@ -68,7 +72,7 @@ def _project_view(vertices: Tensor, faces: Tensor, matrix: Tensor, det_shape: tu
         image = image.index_add(0, row_in * cols + col_in, _whole_pixels(corners, covered, row_in, col_in))
         parts = (x[crossing].split(MAX_CLIPPED_PAIRS) for x in (triangles, row, col))
         for triangle, row_cut, col_cut in zip(*parts):
-            if corners.requires_grad and torch.is_grad_enabled():
+            if corners.requires_grad and torch.is_grad_enabled() and not is_transformed(corners):
                 values = checkpoint(_cut_pixels, corners, triangle, row_cut, col_cut, use_reentrant=False)
             else:
                 values = _cut_pixels(corners, triangle, row_cut, col_cut)

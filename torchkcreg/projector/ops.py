@@ -1,12 +1,17 @@
-"""The point-cloud DRR as a torch operator: fake kernels and autograd.
+"""The point-cloud DRR as a torch operator: fake kernels and derivatives.
 
 Schemas are in ``csrc/ops.cpp``, kernels in ``csrc/cpu``; see `backends` for when they are loaded.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+
+from torchkcreg.differentiable import differentiable
 
 from .backends import choose_backend, load_operators
 from .reference import splat_points
@@ -31,16 +36,38 @@ def point_drr(
         ValueError: for a backend that does not exist or does not serve the device of the points.
         OSError: for ``backend="cpp"`` where the kernels are neither built nor can be compiled.
     """
+    kernel = _PointDrr(table, block_size, rows, cols)
     if choose_backend(points, backend) == "cpp":
-        return torch.ops.torchkcreg.point_drr(points, masses, matrices, table, block_size, rows, cols)
-    return splat_points(points, masses, matrices, table, block_size, rows, cols)
+        return differentiable(kernel, points, masses, matrices)
+    return kernel.reference(points, masses, matrices)
+
+
+@dataclass(frozen=True)
+class _PointDrr:
+    """The operator with what no derivative is asked of."""
+
+    table: Tensor
+    block_size: int
+    rows: int
+    cols: int
+
+    def forward(self, points: Tensor, masses: Tensor, matrices: Tensor) -> Tensor:
+        return torch.ops.torchkcreg.point_drr(
+            points, masses, matrices, self.table, self.block_size, self.rows, self.cols
+        )
+
+    def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
+        found = torch.ops.torchkcreg.point_drr_backward(gradient, *inputs, self.table, self.block_size, *needed[1:])
+        return [g if need else None for g, need in zip(found, needed)]
+
+    def reference(self, points: Tensor, masses: Tensor, matrices: Tensor) -> Tensor:
+        return splat_points(points, masses, matrices, self.table, self.block_size, self.rows, self.cols)
 
 
 def register() -> None:
-    """Fake kernels and autograd of the compiled operator."""
+    """Fake kernels of the compiled operator."""
     torch.library.register_fake("torchkcreg::point_drr", _fake_forward)
     torch.library.register_fake("torchkcreg::point_drr_backward", _fake_backward)
-    torch.library.register_autograd("torchkcreg::point_drr", _backward, setup_context=_setup_context)
 
 
 def _fake_forward(
@@ -64,17 +91,3 @@ def _fake_backward(
         masses.new_empty(masses.shape if need_masses else (0,)),
         matrices.new_empty(matrices.shape if need_matrices else (0,)),
     )
-
-
-def _setup_context(ctx, inputs: tuple, output: Tensor) -> None:
-    points, masses, matrices, table, ctx.block_size, _, _ = inputs
-    ctx.save_for_backward(points, masses, matrices, table)
-
-
-def _backward(ctx, grad: Tensor) -> tuple:
-    need_points, need_masses, need_matrices = ctx.needs_input_grad[:3]
-    grads = torch.ops.torchkcreg.point_drr_backward(
-        grad, *ctx.saved_tensors, ctx.block_size, need_masses, need_matrices
-    )
-    needed = (need_points, need_masses, need_matrices)
-    return *(g if need else None for g, need in zip(grads, needed)), None, None, None, None

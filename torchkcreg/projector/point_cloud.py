@@ -5,10 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchkcreg.precision import full_precision
+
 from .footprint import Footprint, cell_footprint
 from .ops import choose_backend, point_drr
 
 
+@full_precision
 def project_points(
     points: Tensor,  # (..., N, 3)
     masses: Tensor,  # (N,)
@@ -27,8 +30,9 @@ def project_points(
     DRR of a lattice that fills a body is the body's path length. Nodes behind the source or with NaN coordinates are
     skipped, and a footprint that leaves the detector loses just that part.
 
-    Differentiable in points, masses and projection matrices; the shape of the footprint counts as constant. The images
-    have the dtype of the points, whatever that of the matrices.
+    Differentiable in points, masses and projection matrices, in both modes and any order; the shape of the footprint
+    counts as constant, and it is piecewise bilinear: second derivatives are those between its kinks. Under
+    `torch.autocast` it computes in float32. The images have the dtype of the points, whatever that of the matrices.
 
     Args:
         points: nodes in world mm, shape (..., N, 3); leading axes are candidates. Neighbours in memory should be

@@ -20,51 +20,25 @@ SAMPLES_AT_ONCE = 1 << 20  # bounds the memory; changes sums in the last bits at
 
 
 def project_by_planes(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols: int) -> Tensor:
-    """Path integrals (B, V, rows, cols) of volume (B, D, H, W); rays (V, 3, 4) and spacing (3,) in float64.
-
-    Differentiable in the volume; its gradient is `backproject_by_planes`.
-    """
-    return _Project.apply(volume, rays, spacing, rows, cols)
+    """Path integrals (B, V, rows, cols) of volume (B, D, H, W); rays (V, 3, 4) and spacing (3,) in float64."""
+    values, (depth, height, width) = volume.flatten(1), volume.shape[1:]
+    images = volume.new_zeros(len(volume), len(rays), rows * cols)
+    for view, ray in enumerate(rays):
+        for pixels, voxels, weights in _samples(ray, spacing, (depth, height, width), rows, cols):
+            sampled = values[:, voxels] * weights.to(volume.dtype)
+            images[:, view, pixels] += sampled.sum((1, 2))
+    return images.reshape(len(volume), len(rays), rows, cols)
 
 
 def backproject_by_planes(images: Tensor, rays: Tensor, spacing: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """The adjoint of `project_by_planes`: images (B, V, rows, cols) into (B, D, H, W). Differentiable in the images."""
-    return _Backproject.apply(images, rays, spacing, shape)
-
-
-class _Project(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols: int) -> Tensor:
-        ctx.save_for_backward(rays, spacing)
-        ctx.shape = tuple(volume.shape[1:])
-        values = volume.flatten(1)
-        images = volume.new_zeros(len(volume), len(rays), rows * cols)
-        for view, ray in enumerate(rays):
-            for pixels, voxels, weights in _samples(ray, spacing, ctx.shape, rows, cols):
-                sampled = values[:, voxels] * weights.to(volume.dtype)
-                images[:, view, pixels] += sampled.sum((1, 2))
-        return images.reshape(len(volume), len(rays), rows, cols)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        return _Backproject.apply(grad, *ctx.saved_tensors, ctx.shape), None, None, None, None
-
-
-class _Backproject(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, images: Tensor, rays: Tensor, spacing: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        ctx.save_for_backward(rays, spacing)
-        ctx.det_shape = rows, cols = tuple(images.shape[2:])
-        volume = images.new_zeros(len(images), shape[0] * shape[1] * shape[2])
-        for view, ray in enumerate(rays):
-            for pixels, voxels, weights in _samples(ray, spacing, shape, rows, cols):
-                spread = images[:, view].flatten(1)[:, None, None, pixels] * weights.to(images.dtype)
-                volume.index_add_(1, voxels.flatten(), spread.flatten(1))
-        return volume.reshape(len(images), *shape)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        return _Project.apply(grad, *ctx.saved_tensors, *ctx.det_shape), None, None, None
+    """The adjoint of `project_by_planes`: images (B, V, rows, cols) into (B, D, H, W)."""
+    rows, cols = images.shape[2:]
+    volume = images.new_zeros(len(images), shape[0] * shape[1] * shape[2])
+    for view, ray in enumerate(rays):
+        for pixels, voxels, weights in _samples(ray, spacing, shape, rows, cols):
+            spread = images[:, view].flatten(1)[:, None, None, pixels] * weights.to(images.dtype)
+            volume.index_add_(1, voxels.flatten(), spread.flatten(1))
+    return volume.reshape(len(images), *shape)
 
 
 def _samples(

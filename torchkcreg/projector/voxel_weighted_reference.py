@@ -17,49 +17,28 @@ def backproject_by_voxels(images: Tensor, matrices: Tensor, shape: tuple[int, in
     """``sum over views of image(u, v) / depth^2`` at each voxel, (B, D, H, W), from images (B, V, rows, cols).
 
     Images are interpolated bilinearly and fade to zero over one pixel beyond the outermost pixel centres. Voxels behind
-    the source get nothing. Differentiable in the images; the gradient is `spread_over_images`.
+    the source get nothing.
     """
-    return _Backproject.apply(images, matrices, shape)
+    rows, cols = images.shape[2:]
+    volume = images.new_zeros(len(images), shape[0] * shape[1] * shape[2])
+    for part, voxels in _parts(shape, matrices):
+        for view, matrix in enumerate(matrices):
+            for pixel, weight in _neighbours(matrix @ voxels, rows, cols):
+                volume[:, part] += images[:, view].flatten(1)[:, pixel] * weight.to(images.dtype)
+    return volume.reshape(len(images), *shape)
 
 
 def spread_over_images(volume: Tensor, matrices: Tensor, rows: int, cols: int) -> Tensor:
-    """The adjoint of `backproject_by_voxels`: volume (B, D, H, W) into (B, V, rows, cols). Differentiable."""
-    return _Spread.apply(volume, matrices, rows, cols)
-
-
-class _Backproject(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, images: Tensor, matrices: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        ctx.save_for_backward(matrices)
-        ctx.det_shape = tuple(images.shape[2:])
-        volume = images.new_zeros(len(images), shape[0] * shape[1] * shape[2])
-        for part, voxels in _parts(shape, matrices):
-            for view, matrix in enumerate(matrices):
-                for pixel, weight in _neighbours(matrix @ voxels, *ctx.det_shape):
-                    volume[:, part] += images[:, view].flatten(1)[:, pixel] * weight.to(images.dtype)
-        return volume.reshape(len(images), *shape)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        return _Spread.apply(grad, *ctx.saved_tensors, *ctx.det_shape), None, None
-
-
-class _Spread(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, volume: Tensor, matrices: Tensor, rows: int, cols: int) -> Tensor:
-        ctx.save_for_backward(matrices)
-        ctx.shape = tuple(volume.shape[1:])
-        images = volume.new_zeros(len(volume), len(matrices), rows * cols)
-        for part, voxels in _parts(ctx.shape, matrices):
-            values = volume.flatten(1)[:, part]
-            for view, matrix in enumerate(matrices):
-                for pixel, weight in _neighbours(matrix @ voxels, rows, cols):
-                    images[:, view].index_add_(1, pixel, values * weight.to(volume.dtype))
-        return images.reshape(len(volume), len(matrices), rows, cols)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        return _Backproject.apply(grad, *ctx.saved_tensors, ctx.shape), None, None, None
+    """The adjoint of `backproject_by_voxels`: volume (B, D, H, W) into (B, V, rows, cols)."""
+    _, depth, height, width = volume.shape
+    shape = (depth, height, width)
+    images = volume.new_zeros(len(volume), len(matrices), rows * cols)
+    for part, voxels in _parts(shape, matrices):
+        values = volume.flatten(1)[:, part]
+        for view, matrix in enumerate(matrices):
+            for pixel, weight in _neighbours(matrix @ voxels, rows, cols):
+                images[:, view].index_add_(1, pixel, values * weight.to(volume.dtype))
+    return images.reshape(len(volume), len(matrices), rows, cols)
 
 
 def _parts(shape: tuple[int, int, int], matrices: Tensor) -> Iterator[tuple[slice, Tensor]]:

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from torchkcreg.geometry import VolumeGrid
+from torchkcreg.precision import full_precision
 
 from .voxel_ops import voxel_backproject, voxel_backproject_weighted, voxel_project
 
 Views = slice | Sequence[int] | Tensor | None
 
 
+@full_precision
 def project_volume(
     volume: Tensor,  # (..., D, H, W)
     grid: VolumeGrid,
@@ -63,6 +65,7 @@ def project_volume(
     )
 
 
+@full_precision
 def backproject(
     projections: Tensor,  # (..., V, rows, cols)
     grid: VolumeGrid,
@@ -101,6 +104,7 @@ def backproject(
     return volume.reshape(*projections.shape[:-3], *grid.shape)
 
 
+@full_precision
 def backproject_weighted(
     projections: Tensor,  # (..., V, rows, cols)
     grid: VolumeGrid,

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from torchkcreg.precision import full_precision
 from torchkcreg.similarity.ncc import largest_value, unit_contrast
 from torchkcreg.similarity.sobel import erode_mask, sobel_gradient
 
@@ -16,6 +17,7 @@ from torchkcreg.similarity.sobel import erode_mask, sobel_gradient
 _PIXELS_PER_BLOCK = 2**18
 
 
+@full_precision
 def gradient_correlation(moving: Tensor, fixed: Tensor, *, mask: Tensor | None = None) -> Tensor:
     """Gradient correlation of each view, 1 for a perfect match (eq. 4 of Cao et al. 2020).
 

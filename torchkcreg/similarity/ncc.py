@@ -5,11 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchkcreg.precision import full_precision
+
 # An image counts as flat when its RMS contrast is below this many rounding errors of its largest value: what is left
 # is then noise of the arithmetic. Relative, so that it does not matter whether values are 1e-3 or 20.
 _FLAT_ROUNDINGS = 16.0
 
 
+@full_precision
 def normalized_cross_correlation(a: Tensor, b: Tensor, *, mask: Tensor | None = None) -> Tensor:
     """Normalised cross-correlation of each pair of images over its mask: 1 for a perfect match, -1 for the opposite.
 

@@ -9,6 +9,8 @@ import torch.nn.functional as F
 from kornia.filters import spatial_gradient
 from torch import Tensor
 
+from torchkcreg.precision import full_precision
+
 # Adjoint kernels, (gradient image of u and v) -> image. Both Sobel kernels are odd: turned by 180 degrees, as an
 # adjoint asks, they only change sign.
 _ADJOINT_SOBEL = (
@@ -17,6 +19,7 @@ _ADJOINT_SOBEL = (
 )
 
 
+@full_precision
 def sobel_gradient(images: Tensor) -> Tensor:
     """Sobel derivatives of images in grey values per pixel, along u (columns) first, then along v (rows).
 

@@ -1,0 +1,152 @@
+"""Fast operations that are differentiable in every way that torch knows: either mode, any order, `torch.func`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+
+class Kernel(Protocol):
+    """An operation with a fast gradient, and the plain torch that both have to match."""
+
+    @property
+    def forward(self) -> Callable[..., Tensor]:
+        """The result, fast; no derivative is asked of it."""
+
+    @property
+    def reference(self) -> Callable[..., Tensor]:
+        """The result in plain torch, whose derivatives torch knows."""
+
+    def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> Sequence[Tensor | None]:
+        """Gradients to the inputs that need one, fast; no derivative is asked of them."""
+
+
+def differentiable(kernel: Kernel, *inputs: Tensor) -> Tensor:
+    """The kernel's result; its first derivatives in reverse mode are fast, all others those of the reference."""
+    return _Fast.apply(kernel, *inputs)
+
+
+def linear(images: Tensor, apply: Callable[[Tensor], Tensor], transpose: Callable[[Tensor], Tensor]) -> Tensor:
+    """A linear operation, which is its own forward derivative; in reverse mode it is the transposed one.
+
+    Args:
+        images: What it is applied to.
+        apply: The operation; no derivative is asked of it.
+        transpose: The other way.
+    """
+    return _Linear.apply(images, apply, transpose)
+
+
+def is_transformed(tensor: Tensor) -> bool:
+    """Whether a transform of `torch.func` is at work on a tensor: there are no checkpoints under one."""
+    return torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+
+
+def one_by_one(apply: Callable, info: Any, in_dims: tuple, inputs: tuple) -> tuple[Any, Any]:
+    """Results of a batch, one after the other."""
+    results = [
+        apply(*(x if d is None else x.select(d, i) for x, d in zip(inputs, in_dims))) for i in range(info.batch_size)
+    ]
+    if isinstance(results[0], Tensor):
+        return torch.stack(results), 0
+    stacked = tuple(torch.stack(parts) for parts in zip(*results))
+    return stacked, (0,) * len(stacked)
+
+
+def _pushed(function: Callable, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
+    """The forward derivative by reverse mode alone: the transpose of the transpose."""
+    result, pull, *_ = torch.func.vjp(function, *inputs)
+    zero = torch.zeros_like(result) if isinstance(result, Tensor) else tuple(torch.zeros_like(r) for r in result)
+    _, push, *_ = torch.func.vjp(pull, zero)
+    return push(tuple(torch.zeros_like(x) if t is None else t for x, t in zip(inputs, tangents)))[0]
+
+
+class _Fast(torch.autograd.Function):
+    """See `differentiable`."""
+
+    @staticmethod
+    def forward(kernel: Kernel, *inputs: Tensor) -> Tensor:
+        return kernel.forward(*inputs)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.kernel, *tensors = inputs
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple:
+        needed = ctx.needs_input_grad[1:]
+        gradients = _FastGradient.apply(ctx.kernel, needed, gradient, *ctx.saved_tensors)
+        return None, *(g if need else None for g, need in zip(gradients, needed))
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> Tensor:
+        return _pushed(ctx.kernel.reference, ctx.saved_tensors, tangents)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *inputs: Any) -> tuple:
+        return one_by_one(_Fast.apply, info, in_dims, inputs)
+
+
+class _FastGradient(torch.autograd.Function):
+    """The gradient of `_Fast`, with derivatives of its own; zeros where none is needed."""
+
+    @staticmethod
+    def forward(kernel: Kernel, needed: Sequence[bool], gradient: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        gradients = kernel.pullback(gradient, inputs, needed)
+        return tuple(torch.zeros_like(x) if g is None else g for g, x in zip(gradients, inputs))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        ctx.kernel, ctx.needed, *tensors = inputs
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
+
+    @staticmethod
+    def _reference(ctx: Any) -> Callable:
+        def gradients(gradient: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+            found = torch.func.vjp(ctx.kernel.reference, *inputs)[1](gradient)
+            return tuple(g if need else torch.zeros_like(g) for g, need in zip(found, ctx.needed))
+
+        return gradients
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple:
+        return None, None, *torch.func.vjp(_FastGradient._reference(ctx), *ctx.saved_tensors)[1](gradients)
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, *tangents: Tensor | None) -> tuple[Tensor, ...]:
+        return _pushed(_FastGradient._reference(ctx), ctx.saved_tensors, tangents)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *inputs: Any) -> tuple:
+        flat = (in_dims[0], None, *in_dims[2:])  # which gradients are needed is a tuple of its own
+        return one_by_one(_FastGradient.apply, info, flat, inputs)
+
+
+class _Linear(torch.autograd.Function):
+    """See `linear`."""
+
+    @staticmethod
+    def forward(images: Tensor, apply: Callable[[Tensor], Tensor], transpose: Callable[[Tensor], Tensor]) -> Tensor:
+        return apply(images)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        _, ctx.one_way, ctx.other_way = inputs
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple:
+        return _Linear.apply(gradient, ctx.other_way, ctx.one_way), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
+        return _Linear.apply(tangent, ctx.one_way, ctx.other_way)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *inputs: Any) -> tuple:
+        return one_by_one(_Linear.apply, info, in_dims, inputs)
