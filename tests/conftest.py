@@ -1,4 +1,4 @@
-"""A small loaded plate as files, for tests of whole commands."""
+"""A small loaded plate as files, for tests of whole commands; and runs in which nothing may be skipped."""
 
 import pytest
 
@@ -22,6 +22,20 @@ QUICK = {
         {"groups": 2, "iterations": 3, "oversampling": 1},
     ],
 }
+
+DATA_FROM_ELSEWHERE = "no ../shared"
+
+
+def pytest_addoption(parser):
+    parser.addoption("--no-skips", action="store_true", help="a test that is skipped is a failure")
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """Fails a run that skipped more than the tests of data from elsewhere."""
+    skipped = [r for r in terminalreporter.stats.get("skipped", []) if DATA_FROM_ELSEWHERE not in str(r.longrepr)]
+    if config.getoption("--no-skips") and skipped:
+        terminalreporter.write_line(f"{len(skipped)} skipped with --no-skips: {skipped[0].nodeid}, ...", red=True)
+        terminalreporter._session.exitstatus = 1
 
 
 @pytest.fixture(scope="session")

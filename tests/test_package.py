@@ -74,3 +74,9 @@ def test_every_flag_in_the_readme_exists(capsys):
     flags = set(re.findall(r"(?<![\w-])--[a-z]+(?:-[a-z]+)*", README)) - {"--no-build-isolation"}
     assert "--components" in flags
     assert all(any(flag in text for text in texts) for flag in flags)
+
+
+def test_folders_are_there_whatever_was_touched_before():
+    code = "import torchkcreg as kc; print(kc.registration.Trainer.__name__, kc.io.__name__, 'io' in dir(kc))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["Trainer", "torchkcreg.io", "True"]

@@ -40,6 +40,22 @@ _HOMES = {
     "tungsten_spectrum": "physics",
 }
 
+_FOLDERS = (
+    "deformation",
+    "evaluation",
+    "experiments",
+    "geometry",
+    "implant",
+    "io",
+    "physics",
+    "projector",
+    "reconstruction",
+    "registration",
+    "similarity",
+    "simulation",
+    "visualization",
+)
+
 __all__ = [
     "Component",
     "ConeBeamGeometry",
@@ -66,7 +82,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for (PEP 562): ``import torchkcreg`` alone does not load torch."""
+    """A public name or folder, imported when it is first asked for (PEP 562): the package alone does not load torch."""
+    if name in _FOLDERS:
+        return importlib.import_module(f".{name}", __name__)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
@@ -75,4 +93,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *_FOLDERS})

@@ -84,7 +84,7 @@ def test_a_checkpoint_of_another_grid_is_refused() -> None:
     data = image(scene(PLAIN), PLAIN)
     other = PLAIN.model_copy(update={"grid_shape": (4, 4, 12)})
     state = Trainer(scene(other), data, other).state_dict()
-    with pytest.raises(ValueError, match="control_points"):
+    with pytest.raises(ValueError, match="the grid's shape differ"):
         Trainer(scene(PLAIN), data, PLAIN).load_state_dict(state)
 
 

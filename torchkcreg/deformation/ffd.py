@@ -40,6 +40,8 @@ def spline_displacement(
     """
     if control_points.shape[-4:] != (*grid.shape, 3):
         raise ValueError(f"control_points must have shape (..., {grid.shape}, 3), got {tuple(control_points.shape)}")
+    if points.numel() == 0:
+        return points.new_zeros(*control_points.shape[:-4], *points.shape)
     basis = SplineBasis(grid, points.reshape(-1, 3))
     u = basis.evaluate(_cell_features(grid, basis, control_points, labels))
     candidates = control_points.shape[:-4]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -77,10 +76,38 @@ class Scene(nn.Module):
 
     def without_components(self) -> Scene:
         """The implant alone, sharing everything with this scene."""
-        bare = copy.copy(self)
-        bare._set_components([])
-        bare.found = []
+        bare = Scene(
+            self.implant,
+            self.deformation,
+            self.intensity,
+            self.implant_to_world,
+            material=self.material,
+            follow_radius_mm=self.follow_radius_mm,
+            holes=self.holes,
+            metals=list(dict.fromkeys([*self.metals, *(c.material for c in self.components)])),
+            knows_spectrum=self.knows_spectrum,
+        )
+        bare.implant_to_world = self.implant_to_world
         return bare
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Scene:
+        exact = self.implant_to_world
+        super()._apply(fn, recurse)
+        self.implant_to_world = exact.to(self.implant_to_world.device)  # follow .to(device), but not .float()
+        return self
+
+    def description(self) -> dict[str, list[float]]:
+        """What tells this registration from one of another implant, grid or components, as plain numbers."""
+        points, grid = self.implant.points.double(), self.deformation.grid
+        bounds = torch.cat([points.amin(0), points.amax(0)])
+        return {
+            "the implant's nodes": [len(points), round(float(self.implant.masses.double().sum()), 3)],
+            "the implant's bounds": [round(x, 3) for x in bounds.tolist()],
+            "the grid's shape": [float(n) for n in grid.shape],
+            "the grid's frame": [round(x, 3) for x in (*grid.spacing, *grid.frame.flatten().tolist())],
+            "the intensity model": [len(list(self.intensity.parameters()))],
+            "the heads of components": [] if self.found else [round(x, 3) for x in self.heads.flatten().tolist()],
+        }
 
     @torch.no_grad()
     def motion_at(self, head: Sequence[float]) -> Tensor:

@@ -179,6 +179,7 @@ class Trainer:
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain types that :meth:`load_state_dict` continues from."""
         return {
+            "registered": self.scene.description(),
             "scene": self.scene.moving_state(),
             "next_stage": self.next_stage,
             "history": self.history,
@@ -194,10 +195,9 @@ class Trainer:
         Raises:
             ValueError: If the checkpoint belongs to another scene.
         """
-        own = self.scene.state_dict()
-        unknown = [n for n, v in state["scene"].items() if n not in own or own[n].shape != v.shape]
-        if unknown:
-            raise ValueError(f"the checkpoint does not fit this registration: {', '.join(unknown)} differ")
+        own, theirs = self.scene.description(), state.get("registered", {})
+        if differ := sorted(n for n in own.keys() | theirs.keys() if own.get(n) != theirs.get(n)):
+            raise ValueError(f"the checkpoint does not fit this registration: {', '.join(differ)} differ")
         found = [FoundScrew(**screw) for screw in state["screws"]]
         self.scene.restore((state["scene"], found, state["tilts"]), self.config.pitch_mm)
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])

@@ -1,0 +1,68 @@
+"""What a registration shares with the program around it, and what it takes up again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from small_scene import SCREW, image, scene
+from test_register import PLAIN
+
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.registration import Stage, Trainer, build_scene
+from torchkcreg.registration.optimizers import cmaes
+
+
+def test_a_checkpoint_of_another_implant_is_refused() -> None:
+    data = image(scene(PLAIN), PLAIN)
+    state = Trainer(scene(PLAIN), data, PLAIN).state_dict()
+    Trainer(scene(PLAIN), data, PLAIN).load_state_dict(state)
+    other = ImplantPointCloud.from_mesh(trimesh.creation.box((9.0, 5.0, 60.0)), PLAIN.pitch_mm)
+    with pytest.raises(ValueError, match=r"does not fit this registration: .*the implant's bounds"):
+        Trainer(build_scene(other, PLAIN), data, PLAIN).load_state_dict(state)
+    finer = PLAIN.model_copy(update={"grid_spacing_mm": (8.0, 8.0, 16.0)})
+    with pytest.raises(ValueError, match="the grid's frame"):
+        Trainer(scene(finer), data, finer).load_state_dict(state)
+    with pytest.raises(ValueError, match="the heads of components differ"):
+        Trainer(scene(PLAIN, components=[SCREW]), data, PLAIN).load_state_dict(state)
+
+
+class _Bowl:
+    num_parameters = 2
+
+    def losses(self, candidates: torch.Tensor) -> torch.Tensor:
+        return (candidates - 0.3).square().sum(-1)
+
+    def project(self, parameters: torch.Tensor) -> torch.Tensor:
+        return parameters
+
+
+def test_cma_es_leaves_the_callers_random_numbers_alone() -> None:
+    stage = Stage(optimizer="cmaes", iterations=20)
+    np.random.seed(5)  # noqa: NPY002
+    expected = np.random.random(3)  # noqa: NPY002
+    np.random.seed(5)  # noqa: NPY002
+    found = [cmaes(_Bowl(), stage, 7, lambda progress: None) for _ in range(2)]
+    assert np.array_equal(np.random.random(3), expected)  # noqa: NPY002
+    assert torch.equal(*found)
+    assert not torch.equal(found[0], cmaes(_Bowl(), stage, 8, lambda progress: None))
+    torch.testing.assert_close(found[0], torch.full((2,), 0.3, dtype=torch.float64), atol=0.02, rtol=0)
+
+
+def test_a_pose_keeps_its_precision_and_a_bare_scene_its_own_parts() -> None:
+    full = scene(PLAIN, components=[SCREW])
+    pose = full.implant_to_world.clone()
+    bare = full.without_components()
+    assert full.float().implant_to_world.dtype == torch.float64
+    assert torch.equal(full.implant_to_world, pose)
+    assert bare.components == [] and len(full.components) == 1
+    assert bare.materials == full.materials
+    assert bare.deformation is full.deformation
+    bare.register_buffer("another", torch.zeros(1))
+    assert "another" not in full.state_dict()
+
+
+def test_no_points_are_displaced_by_nothing() -> None:
+    deformation = scene(PLAIN).deformation
+    assert deformation.displacement(torch.zeros(0, 3)).shape == (0, 3)
