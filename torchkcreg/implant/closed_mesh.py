@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+_FARTHEST_MM = 1e7
 _MOST_BODIES = 1000  # that are looked at one by one
 
 
@@ -28,8 +29,14 @@ def closed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"mesh must be a trimesh.Trimesh with faces, got {mesh!r}")
+    if mesh.vertices.ndim != 2 or mesh.vertices.shape[1] != 3:
+        raise ValueError(f"mesh must have vertices of shape (n, 3), got {mesh.vertices.shape}")
     if not np.isfinite(mesh.vertices).all():
         raise ValueError("mesh must have finite vertices")
+    if (largest := float(np.abs(mesh.vertices).max())) > _FARTHEST_MM:
+        raise ValueError(f"mesh must have vertices within {_FARTHEST_MM:g} mm, got one at {largest:.3g}")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise ValueError(f"mesh must have faces of its {len(mesh.vertices)} vertices, got others")
     merged = trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     faces = _distinct(np.asarray(merged.faces, dtype=np.int64))

@@ -194,13 +194,13 @@ def _convert(
 def _from_line_integrals(image: NDArray, mask: NDArray) -> Projections:
     if image.dtype.kind in "ui":
         raise ValueError(f"{image.dtype} values look like intensities, not line integrals: give their open_beam")
-    finite = np.isfinite(image)
+    finite = np.abs(image) < np.finfo(np.float32).max  # which NaN is not either
     values = torch.from_numpy(np.where(finite, image, 0).astype(np.float32))
     return Projections(values, torch.from_numpy(finite & mask), _counts(finite, finite, mask))
 
 
 def _from_intensity(image: NDArray, mask: NDArray, beam: NDArray, saturation: float | None) -> Projections:
-    finite = np.isfinite(image)
+    finite = np.abs(image) < np.finfo(np.float32).max
     positive = np.greater(image, 0, where=finite, out=np.zeros_like(finite))
     largest = image.max() if image.dtype.kind in "ui" else None
     ceiling = saturation if saturation is not None else largest if largest in DETECTOR_CEILINGS else None
