@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from torchkcreg.geometry import ConeBeamGeometry
+from torchkcreg.implant import volume
 from torchkcreg.io import RunFolder, geometry_from_dict, read_json, read_mesh, read_projections, versions
 from torchkcreg.projector.extension import PACKAGE
 from torchkcreg.projector.ops import choose_backend, load_operators
@@ -59,9 +60,10 @@ def describe(path: Path, *, open_beam: float | None = None) -> str:
 
 def _mesh(path: Path) -> str:
     mesh = read_mesh(path)
-    size = " x ".join(f"{extent:.4g}" for extent in mesh.extents)
-    center = ", ".join(f"{x:.4g}" for x in mesh.bounds.mean(axis=0))
-    return f"closed mesh, {len(mesh.faces)} triangles, {size} mm about ({center}), volume {mesh.volume:.6g} mm^3"
+    low, high = mesh.bounds
+    size = " x ".join(f"{extent:.4g}" for extent in high - low)
+    center = ", ".join(f"{x:.4g}" for x in (low + high) / 2)
+    return f"closed mesh, {len(mesh.faces)} triangles, {size} mm about ({center}), volume {volume(mesh):.6g} mm^3"
 
 
 def _geometry(path: Path) -> str:

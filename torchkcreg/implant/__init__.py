@@ -1,6 +1,6 @@
 """Known components: an implant as a point cloud of nodes, volumes and cells, from a mesh or from a volume; screws."""
 
-from torchkcreg.implant.closed_mesh import closed_mesh, closed_triangles
+from torchkcreg.implant.closed_mesh import closed_mesh, closed_triangles, volume
 from torchkcreg.implant.components import Component, cylinder_cloud, cylinder_mesh
 from torchkcreg.implant.holes import Hole, find_holes
 from torchkcreg.implant.morton import morton_order
@@ -20,6 +20,7 @@ __all__ = [
     "fill_cells",
     "find_holes",
     "morton_order",
+    "volume",
     "voxelize_mesh",
     "voxelize_points",
 ]

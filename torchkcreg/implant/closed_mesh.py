@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 _FARTHEST_MM = 1e7
+_ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _MOST_BODIES = 1000  # that are looked at one by one
 
 
@@ -37,8 +38,7 @@ def closed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         raise ValueError(f"mesh must have vertices within {_FARTHEST_MM:g} mm, got one at {largest:.3g}")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise ValueError(f"mesh must have faces of its {len(mesh.vertices)} vertices, got others")
-    merged = trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False)
-    merged.merge_vertices(merge_tex=True, merge_norm=True)
+    merged = _merged(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces))
     faces = _distinct(np.asarray(merged.faces, dtype=np.int64))
     if len(faces) == 0 or np.ptp(merged.vertices, axis=0).max() == 0:
         raise ValueError("mesh must enclose a volume, got none")
@@ -54,6 +54,19 @@ def closed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
             raise ValueError("mesh must have an inside and an outside, but its faces cannot be wound consistently")
     faces = _turned_outwards(np.asarray(merged.vertices), faces)
     return trimesh.Trimesh(merged.vertices, faces, process=False)
+
+
+def _merged(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
+    """A mesh whose vertices at the same place are one."""
+    bits = (vertices + 0.0).view(np.uint64)  # no -0.0
+    bits ^= bits >> np.uint64(31)  # the last bits of what was single precision are all zero
+    hashed = bits[:, 0] * _ODD[0] + bits[:, 1] * _ODD[1] + bits[:, 2] * _ODD[2]
+    _, first, index = np.unique(hashed, return_index=True, return_inverse=True)
+    if np.array_equal(vertices[first][index], vertices):  # quick, and nearly always right: fewer are left to compare
+        vertices, faces = vertices[first], index[faces]
+    merged = trimesh.Trimesh(vertices.copy(), faces.copy(), process=False)
+    merged.merge_vertices(merge_tex=True, merge_norm=True)
+    return merged
 
 
 def _distinct(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -81,10 +94,21 @@ def _two_sided(faces: NDArray[np.int64]) -> bool:
     return bool(np.array_equal(np.sort(keys[upwards]), np.sort(keys[~upwards])))
 
 
+def volume(mesh: trimesh.Trimesh) -> float:
+    """What a closed mesh encloses, mm^3."""
+    return float(_tetrahedra(np.asarray(mesh.vertices)[np.asarray(mesh.faces)]).sum())
+
+
+def _tetrahedra(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Volumes (m,) between the triangles and their common middle, those seen from inside negative."""
+    a, b, c = (triangles - triangles.mean((0, 1))).transpose(1, 2, 0)
+    cross = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
+    return sum(x * y for x, y in zip(a, cross)) / 6
+
+
 def _turned_outwards(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """Faces whose bodies hold a positive volume, but for cavities."""
-    corners = vertices[faces] - vertices[faces].mean((0, 1))
-    volumes = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6  # of tetrahedra below
+    volumes = _tetrahedra(vertices[faces])
     links = coo_array((np.ones(2 * len(faces)), (faces[:, [0, 1]].T.ravel(), faces[:, [1, 2]].T.ravel())))
     links.resize(len(vertices), len(vertices))
     count, labels = connected_components(links, directed=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import struct
 
@@ -10,6 +9,7 @@ import numpy as np
 import trimesh
 
 _HEADER, _TRIANGLE = 84, 50  # bytes
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 _FLAGS = re.MULTILINE | re.IGNORECASE
 _VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)[ \t]*$", _FLAGS)
 _WORDS = [re.compile(rb"^[ \t]*" + word + rb"\b", _FLAGS) for word in (b"facet", b"endfacet", b"solid", b"endsolid")]
@@ -34,10 +34,7 @@ def load_stl(content: bytes) -> trimesh.Trimesh:
             "it is cut off or its count is wrong" if len(content) < expected else "its count is wrong or bytes follow"
         )
         raise ValueError(f"{what}: {count} triangles take {expected} bytes, it has {len(content)}")
-    loaded = trimesh.load(io.BytesIO(content), file_type="stl", force="mesh", process=False)
-    if not isinstance(loaded, trimesh.Trimesh):
-        raise ValueError("it holds no triangles")
-    return loaded
+    return _soup(np.frombuffer(content, _RECORD, count, _HEADER)["corners"])
 
 
 def is_text(content: bytes) -> bool:
@@ -59,7 +56,11 @@ def _load_text(content: bytes) -> trimesh.Trimesh:
             f"{solids} solids begin and {closed} end"
         )
     try:
-        vertices = np.array(corners).astype(np.float64).reshape(-1, 3)
+        return _soup(np.array(corners).astype(np.float64))
     except ValueError as error:
         raise ValueError(f"it has a vertex that is no number: {error}") from None
+
+
+def _soup(corners: np.ndarray) -> trimesh.Trimesh:
+    vertices = corners.astype(np.float64).reshape(-1, 3)
     return trimesh.Trimesh(vertices, np.arange(len(vertices)).reshape(-1, 3), process=False)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-import cma
 import numpy as np
 import torch
 from torch import Tensor
@@ -55,6 +54,8 @@ def minimize(problem: Problem, stage: Stage, *, seed: int, report: Report) -> Te
 
 def cmaes(problem: Problem, stage: Stage, seed: int, report: Report) -> Tensor:
     """Covariance matrix adaptation evolution strategy (library ``cma``); a whole generation is one batch."""
+    import cma  # late: it brings a plotting library along, and few registrations need it
+
     options = {
         "popsize": stage.population,
         "maxiter": stage.iterations,
