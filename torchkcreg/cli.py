@@ -13,10 +13,10 @@ from typing import NoReturn
 import torchkcreg
 from torchkcreg.console import one_line, run_command
 
-# Before torch starts its threads: where other programs use the cores too, threads that wait by spinning hold each
-# other up, and a registration takes ten times as long.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
+# Before torch starts its threads. Between small operations they wait by spinning for a few microseconds: asleep at once,
+# they double the time of a registration; spinning for long, they hold each other up where other programs use the cores.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 _FAILED = 3  # exit status
 
