@@ -13,8 +13,8 @@ from typing import NoReturn
 import torchkcreg
 from torchkcreg.console import one_line, run_command
 
-# Before torch starts its threads. Between small operations they wait by spinning for a few microseconds: asleep at once,
-# they double the time of a registration; spinning for long, they hold each other up where other programs use the cores.
+# Before torch starts its threads. Between small operations they wait by spinning for a few microseconds: asleep at
+# once, they double the time of a registration; spinning for long, they stop each other where other programs run.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
