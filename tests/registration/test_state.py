@@ -11,7 +11,7 @@ from test_register import PLAIN
 
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import Stage, Trainer, build_scene
-from torchkcreg.registration.optimizers import cmaes
+from torchkcreg.registration.optimizers import cmaes, gauss_newton
 
 
 def test_a_checkpoint_of_another_implant_is_refused() -> None:
@@ -66,3 +66,31 @@ def test_a_pose_keeps_its_precision_and_a_bare_scene_its_own_parts() -> None:
 def test_no_points_are_displaced_by_nothing() -> None:
     deformation = scene(PLAIN).deformation
     assert deformation.displacement(torch.zeros(0, 3)).shape == (0, 3)
+
+
+class _Valley:
+    """A narrow valley along which two parameters trade; its bottom lies beyond the bound of the first one."""
+
+    num_parameters = 2
+    bottom = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    matrix = torch.tensor([[1.0, 0.99], [0.99, 1.0]], dtype=torch.float64)
+
+    def losses(self, candidates: torch.Tensor) -> torch.Tensor:
+        off = candidates - self.bottom
+        return 1 + ((off @ self.matrix) * off).sum(-1)
+
+    def loss_and_gradient(self, parameters: torch.Tensor) -> tuple[float, torch.Tensor]:
+        return float(self.losses(parameters[None])[0]), 2 * self.matrix @ (parameters - self.bottom)
+
+    def curvature(self, parameters: torch.Tensor) -> torch.Tensor:
+        return 2 * self.matrix
+
+    def project(self, parameters: torch.Tensor) -> torch.Tensor:
+        return torch.stack([parameters[:, 0].clamp_min(0.0), parameters[:, 1]], dim=-1)
+
+
+def test_a_parameter_at_its_bound_does_not_lead_the_others_astray() -> None:
+    """Where the first is held at 0 the best of the second is 0.01, not the 1 that goes with the first at -1."""
+    stage = Stage(optimizer="gauss-newton", iterations=3, tolerance=1e-9, step_mm=10.0)
+    found = gauss_newton(_Valley(), stage, 0, lambda progress: None)
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.01], dtype=torch.float64), atol=1e-3, rtol=0)

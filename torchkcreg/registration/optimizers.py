@@ -118,8 +118,7 @@ def gauss_newton(problem: Problem, stage: Stage, seed: int, report: Report) -> T
     damping, iteration = 1e-3, 0
     while iteration < stage.iterations:
         iteration += 1
-        step = _damped_step(curvature, gradient, damping, stage.step_mm)
-        trial = problem.project((parameters + step)[None])[0]
+        trial = _within_bounds(problem, parameters, curvature, gradient, damping, stage.step_mm)
         step = trial - parameters
         predicted = float(-(gradient @ step) - 0.5 * step @ curvature @ step)
         trial_loss = float(problem.losses(trial[None])[0])
@@ -141,6 +140,21 @@ def gauss_newton(problem: Problem, stage: Stage, seed: int, report: Report) -> T
         elif fresh and damping > 1e6:
             break
     return parameters
+
+
+def _within_bounds(
+    problem: Problem, parameters: Tensor, curvature: Tensor, gradient: Tensor, damping: float, longest: float
+) -> Tensor:
+    """Where a damped step leads inside the bounds; the free parameters know which ones a bound holds back."""
+    wanted = parameters + _damped_step(curvature, gradient, damping, longest)
+    trial = problem.project(wanted[None])[0]
+    free = trial == wanted
+    if free.all() or not free.any():
+        return trial
+    held = (trial - parameters)[~free]
+    rest = gradient[free] + curvature[free][:, ~free] @ held
+    trial[free] = parameters[free] + _damped_step(curvature[free][:, free], rest, damping, longest)
+    return problem.project(trial[None])[0]
 
 
 def _damped_step(curvature: Tensor, gradient: Tensor, damping: float, longest: float) -> Tensor:
