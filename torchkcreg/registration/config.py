@@ -42,8 +42,8 @@ class Stage(BaseModel):
         robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
         contrast: The images' contrast counts too (:class:`torchkcreg.similarity.GradientDifference`), not only its
             shape (gradient correlation).
-        estimate: Parameters of the intensity model that are estimated along, with priors about where they start: "scatter"
-            that comes with what passes, "removed" (scatter of what is removed), "blur", "hardness".
+        estimate: Parameters of the intensity model that are estimated along, with priors about where they start:
+            "scatter" that comes with what passes, "removed" (scatter of what is removed), "blur", "hardness".
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
