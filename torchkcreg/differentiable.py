@@ -33,7 +33,7 @@ def linear(images: Tensor, apply: Callable[[Tensor], Tensor], transpose: Callabl
     """A linear operation, which is its own forward derivative; in reverse mode it is the transposed one.
 
     Args:
-        images: What it is applied to.
+        images: What it is applied to, one by one along the first axis.
         apply: The operation; no derivative is asked of it.
         transpose: The other way.
     """
@@ -148,5 +148,7 @@ class _Linear(torch.autograd.Function):
         return _Linear.apply(tangent, ctx.one_way, ctx.other_way)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple, *inputs: Any) -> tuple:
-        return one_by_one(_Linear.apply, info, in_dims, inputs)
+    def vmap(info: Any, in_dims: tuple, images: Tensor, *maps: Callable[[Tensor], Tensor]) -> tuple[Tensor, int]:
+        batch = images.movedim(in_dims[0], 0)
+        result = _Linear.apply(batch.flatten(0, 1), *maps)
+        return result.unflatten(0, batch.shape[:2]), 0

@@ -87,7 +87,17 @@ class SplineBasis:
             yield cell, rows, torch.stack([weights(rows) for weights in along], dim=1)
 
 
-class _Evaluate(torch.autograd.Function):
+class _Splines(torch.autograd.Function):
+    """Splines at points eta (N, 3), linear in the data of the CPs or of the points."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        eta, data, ctx.blocks, ctx.orders, *ctx.sizes = inputs
+        ctx.save_for_backward(eta, data)
+        ctx.save_for_forward(eta, data)
+
+
+class _Evaluate(_Splines):
     @staticmethod
     def forward(eta: Tensor, features: Tensor, blocks: _Blocks, orders: _Orders) -> Tensor:
         weights, size = _Workspace(eta, orders), features.shape[-1]
@@ -95,12 +105,6 @@ class _Evaluate(torch.autograd.Function):
         for cell, rows in blocks:
             out.index_copy_(0, rows, torch.mm(weights(rows).T, features[cell], out=block[: len(rows)]))
         return out
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        eta, features, ctx.blocks, ctx.orders = inputs
-        ctx.save_for_backward(eta, features)
-        ctx.save_for_forward(eta, features)
 
     @staticmethod
     def jvp(ctx: Any, along: Tensor | None, tangent: Tensor | None, *_: None) -> Tensor:
@@ -127,7 +131,7 @@ class _Evaluate(torch.autograd.Function):
         return grad_eta, grad_features, None, None
 
 
-class _Scatter(torch.autograd.Function):
+class _Scatter(_Splines):
     @staticmethod
     def forward(eta: Tensor, values: Tensor, blocks: _Blocks, orders: _Orders, num_cells: int) -> Tensor:
         out = values.new_zeros(num_cells, 64, values.shape[-1])
@@ -137,20 +141,14 @@ class _Scatter(torch.autograd.Function):
         return out
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        eta, values, ctx.blocks, ctx.orders, ctx.num_cells = inputs
-        ctx.save_for_backward(eta, values)
-        ctx.save_for_forward(eta, values)
-
-    @staticmethod
     def jvp(ctx: Any, along: Tensor | None, tangent: Tensor | None, *_: None) -> Tensor:
         eta, values = ctx.saved_tensors
         total = torch.zeros((), dtype=values.dtype)
         if tangent is not None:
-            total = total + _Scatter.apply(eta, tangent, ctx.blocks, ctx.orders, ctx.num_cells)
+            total = total + _Scatter.apply(eta, tangent, ctx.blocks, ctx.orders, *ctx.sizes)
         if along is not None:
             for a, orders in enumerate(_steeper(ctx.orders)):
-                total = total + _Scatter.apply(eta, along[:, a : a + 1] * values, ctx.blocks, orders, ctx.num_cells)
+                total = total + _Scatter.apply(eta, along[:, a : a + 1] * values, ctx.blocks, orders, *ctx.sizes)
         return total
 
     @staticmethod

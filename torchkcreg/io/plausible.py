@@ -49,10 +49,10 @@ def stuck_pixels(image: NDArray, saturated: NDArray[np.bool_], ceiling: float) -
     A region of open beam is wide, or moves from view to view; a single view cannot tell.
     """
     always = saturated.all(0)
-    if len(image) < 2 or not always.any():
-        return np.zeros_like(saturated)
     thin = always & ~binary_opening(always, np.ones((3, 3)))
-    dark = [median_filter(view.astype(np.float32), 5) < _ALONE * ceiling for view in image] if thin.any() else [thin]
+    if len(image) < 2 or not thin.any():
+        return np.zeros_like(saturated)
+    dark = [median_filter(view.astype(np.float32), 5) < _ALONE * ceiling for view in image]
     return np.broadcast_to(thin & np.all(dark, axis=0), saturated.shape).copy()
 
 
@@ -92,11 +92,10 @@ class ImageHeader:
 def implausible_magnification(geometry: ConeBeamGeometry, points: Tensor) -> str | None:
     """What is doubtful about where an object (N, 3) stands between source and detector; None if nothing is."""
     depth = geometry.project(points.double())[1].median(-1).values
-    ratios = (geometry.detector_distances / depth).tolist()
-    view = max(range(len(ratios)), key=lambda i: ratios[i])
-    if min(ratios) < _MAGNIFICATION[0]:
-        view = min(range(len(ratios)), key=lambda i: ratios[i])
-        return f"the object would stand behind the detector in view {view}: do pixel spacing and matrices fit, in mm?"
-    if ratios[view] > _MAGNIFICATION[1]:
-        return f"the object would be magnified {ratios[view]:.1f} times in view {view}: are matrices and mesh in mm?"
+    ratios = geometry.detector_distances / depth
+    least, most = int(ratios.argmin()), int(ratios.argmax())
+    if float(ratios[least]) < _MAGNIFICATION[0]:
+        return f"the object would stand behind the detector in view {least}: do pixel spacing and matrices fit, in mm?"
+    if float(ratios[most]) > _MAGNIFICATION[1]:
+        return f"the object would be magnified {ratios[most]:.1f} times in view {most}: are matrices and mesh in mm?"
     return None

@@ -19,7 +19,7 @@ def read_points(path: str | os.PathLike[str]) -> Tensor:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no such table, see `torchkcreg.io.read_table`; the message names the line.
+        ValueError: it is no such table, see `torchkcreg.io.tables.read_table`; the message names the line.
     """
     return torch.from_numpy(read_table(path, "points", _XYZ))
 

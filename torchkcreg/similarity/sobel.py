@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import torch.nn.functional as F
 from kornia.filters import spatial_gradient
 from torch import Tensor
 
+from torchkcreg.differentiable import linear
 from torchkcreg.precision import full_precision
 
 # Adjoint kernels, (gradient image of u and v) -> image. Both Sobel kernels are odd: turned by 180 degrees, as an
@@ -45,7 +44,7 @@ def sobel_gradient(images: Tensor) -> Tensor:
     if not images.is_floating_point():
         raise ValueError(f"images must be floating point, got {images.dtype}")
     # One channel each: kornia then folds all leading axes into the batch of a single convolution.
-    flat = _Sobel.apply(images.reshape(-1, 1, *images.shape[-2:]))
+    flat = linear(images.reshape(-1, 1, *images.shape[-2:]), _sobel, _adjoint)
     return flat.reshape(*images.shape[:-2], 2, *images.shape[-2:])
 
 
@@ -62,55 +61,21 @@ def erode_mask(mask: Tensor) -> Tensor:
     return (F.max_pool2d(bad, kernel_size=3, stride=1, padding=1) == 0).reshape(mask.shape)
 
 
-class _Sobel(torch.autograd.Function):
-    """kornia's Sobel filter of (B, 1, rows, cols), with its adjoint as a plain convolution.
+def _sobel(images: Tensor) -> Tensor:
+    """kornia's Sobel filter: (B, 1, rows, cols) -> (B, 2, rows, cols)."""
+    return spatial_gradient(images, mode="sobel", order=1, normalized=True).squeeze(1)
+
+
+def _adjoint(gradients: Tensor) -> Tensor:
+    """Adjoint of `_sobel`: (B, 2, rows, cols) -> (B, 1, rows, cols), as a plain convolution.
 
     Autograd's own adjoint is a transposed convolution, which on a CPU takes five to ten times as long.
     """
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(images: Tensor) -> Tensor:
-        return spatial_gradient(images, mode="sobel", order=1, normalized=True).squeeze(1)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        return _SobelAdjoint.apply(grad)
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        return _Sobel.apply(tangent)
-
-
-class _SobelAdjoint(torch.autograd.Function):
-    """Adjoint of `_Sobel`: (B, 2, rows, cols) -> (B, 1, rows, cols)."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(gradients: Tensor) -> Tensor:
-        kernel = torch.tensor(_ADJOINT_SOBEL, dtype=gradients.dtype, device=gradients.device)[None]
-        padded = F.conv2d(gradients, kernel, padding=2)
-        # Adjoint of repeating the border: what fell outside returns to the border pixel it was a copy of.
-        padded[..., 1, :] += padded[..., 0, :]
-        padded[..., -2, :] += padded[..., -1, :]
-        padded[..., :, 1] += padded[..., :, 0]
-        padded[..., :, -2] += padded[..., :, -1]
-        return padded[..., 1:-1, 1:-1].contiguous()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        return _Sobel.apply(grad)
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        return _SobelAdjoint.apply(tangent)
+    kernel = torch.tensor(_ADJOINT_SOBEL, dtype=gradients.dtype, device=gradients.device)[None]
+    padded = F.conv2d(gradients, kernel, padding=2)
+    # Adjoint of repeating the border: what fell outside returns to the border pixel it was a copy of.
+    padded[..., 1, :] += padded[..., 0, :]
+    padded[..., -2, :] += padded[..., -1, :]
+    padded[..., :, 1] += padded[..., :, 0]
+    padded[..., :, -2] += padded[..., :, -1]
+    return padded[..., 1:-1, 1:-1].contiguous()
