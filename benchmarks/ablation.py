@@ -52,21 +52,24 @@ def variants() -> Iterator[Variant]:
     default = RegistrationConfig(material="steel")
     stages = preset_stages("gauss-newton")
 
-    def having(**changes: object) -> RegistrationConfig:
-        updates = [{k: v for k, v in changes.items() if k in stage.model_fields_set} for stage in stages]
-        changed = tuple(s.model_copy(update=u) for s, u in zip(stages, updates, strict=True))
+    def without(*names: str) -> RegistrationConfig:
+        left = [
+            {field: tuple(x for x in getattr(s, field) if x not in names) for field in ("before", "estimate")}
+            for s in stages
+        ]
+        changed = tuple(s.model_copy(update=update) for s, update in zip(stages, left, strict=True))
         return default.model_copy(update={"stages": changed})
 
     groups = (
         *(s for s in stages if s.modes is None),
-        Stage(groups=5, pitch_factor=2, estimate=stages[-1].estimate, background=True, robust=True, screws="fit"),
-        Stage(groups=10, pitch_factor=2, estimate=stages[-1].estimate, background=True, robust=True, screws="fit"),
+        Stage(groups=5, pitch_factor=2, estimate=stages[-1].estimate, before=stages[-1].before),
+        Stage(groups=10, pitch_factor=2, estimate=stages[-1].estimate, before=stages[-1].before),
     )
     yield Variant("everything; screws and spectrum given", default)
     yield Variant("everything; screws found, spectrum assumed", default, knows_screws=False, knows_spectrum=False)
-    yield Variant("no weights of pixels", having(robust=False))
-    yield Variant("no background", having(background=False))
-    yield Variant("no estimate of scatter and blur", having(estimate=()))
+    yield Variant("no weights of pixels", without("reweight"))
+    yield Variant("no background", without("background"))
+    yield Variant("no estimate of scatter and blur", without("scatter", "removed", "blur", "hardness"))
     yield Variant("5 and 10 groups in place of modes", default.model_copy(update={"stages": groups}))
     yield Variant("no charge for loads", default.model_copy(update={"load_weight": 0.0}))
     yield Variant("screws neither given nor looked for", default, knows_screws=False, finds_screws=False)

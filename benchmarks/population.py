@@ -51,7 +51,7 @@ class _ErrorsOfStages(Callback):
         self.errors: list[str] = []
 
     def on_stage_end(self, trainer: Trainer, index: int, stage: Any) -> None:
-        error = float(bb_rmse(trainer.scene.nodes(), self.truth))
+        error = float(bb_rmse(trainer.scene.assemblies[0].nodes(), self.truth))
         self.errors.append(f"{error:.3f}/{trainer.history[-1]['loss']:.4f}")
 
 

@@ -3,7 +3,6 @@
 import pytest
 
 from torchkcreg.io import (
-    ComponentSpec,
     write_components,
     write_config,
     write_geometry,
@@ -46,11 +45,7 @@ def small_case(tmp_path_factory):
     write_mesh(folder / "implant.stl", case.implant)
     write_geometry(folder / "geometry.json", case.geometry)
     write_projections(folder / "projections.npz", intensity=case.intensity, open_beam=case.open_beam)
-    screws = [
-        ComponentSpec(tuple(s["from"]), tuple(s["to"]), s["radius"], s["material"], f"screw{i}")
-        for i, s in enumerate(case.screws)
-    ]
-    write_components(folder / "screws.json", screws)
+    write_components(folder / "screws.json", case.screws)
     write_spectrum(folder / "spectrum.csv", tungsten_spectrum(90))
     write_config(folder / "quick.yaml", QUICK)
     write_points(folder / "before.csv", case.beads_before)

@@ -18,14 +18,14 @@ from torchkcreg.similarity import gradient_correlation
 
 GEOMETRY = circular_geometry([0, 70], sad=404, sdd=538, det_shape=(14, 12), pixel_spacing=(4.0, 4.0))
 CLOUD = ImplantPointCloud.from_mesh(trimesh.creation.box((7.3, 11.1, 17.7)), pitch=3.0)
-POINTS, MASSES = CLOUD.points.double(), CLOUD.masses.double()
+POINTS, VOLUMES = CLOUD.points.double(), CLOUD.volumes.double()
 TURN = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
 
 
 def points_of(backend: str) -> Callable[[Tensor], Tensor]:
     projector = PointCloudProjector(GEOMETRY, backend=backend)
     footprint = cell_footprint(POINTS, CLOUD.cell.double(), GEOMETRY.projection_matrices)  # its shape is a constant
-    return lambda x: projector(POINTS * (1 + 0.05 * x) + x, MASSES, footprint=footprint)
+    return lambda x: projector(POINTS * (1 + 0.05 * x) + x, VOLUMES, footprint=footprint)
 
 
 def volume_of(backend: str) -> Callable[[Tensor], Tensor]:

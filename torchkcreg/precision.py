@@ -1,13 +1,13 @@
-"""Operations that compute in single precision or better under autocast: half of it is not enough for them."""
+"""What keeps its precision: operations under autocast, and the poses and matrices of modules."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -36,3 +36,21 @@ _HALF = (torch.float16, torch.bfloat16)
 
 def _single(value: Any) -> Any:
     return value.float() if isinstance(value, Tensor) and value.dtype in _HALF else value
+
+
+class ExactModule(nn.Module):
+    """A module some of whose buffers follow it to other devices but keep their precision whatever it is cast to.
+
+    A pose in single precision is off by micrometres, a projection matrix by thousandths of a pixel.
+    """
+
+    exact_buffers: ClassVar[tuple[str, ...]] = ()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ExactModule:
+        kept = {name: getattr(self, name) for name in self.exact_buffers}
+        super()._apply(fn, recurse)
+        for name, value in kept.items():
+            moved = getattr(self, name)
+            if moved.dtype != value.dtype:  # follow .to(device), but not .float()
+                setattr(self, name, value.to(moved.device))
+        return self

@@ -8,7 +8,7 @@ import torch
 from torchkcreg.deformation import (
     ControlPointGrid,
     cluster_control_points,
-    control_point_masses,
+    control_point_volumes,
     default_grid,
     spline_displacement,
 )
@@ -28,7 +28,7 @@ def plate(length=200.0, width=12.0, thickness=4.0):
 def loaded():
     points = plate()
     grid = default_grid(points)
-    return grid, points, control_point_masses(grid, points, torch.ones(len(points)))
+    return grid, points, control_point_volumes(grid, points, torch.ones(len(points)))
 
 
 def test_control_points_carry_the_implants_volume_and_its_first_moment(loaded):
@@ -38,19 +38,19 @@ def test_control_points_carry_the_implants_volume_and_its_first_moment(loaded):
     assert torch.allclose((weights[..., None] * grid.positions()).sum((0, 1, 2)), grid.to_grid(points).sum(0))
 
 
-def test_masses_are_the_adjoint_of_the_field():
+def test_volumes_are_the_adjoint_of_the_field():
     grid = ControlPointGrid((5, 5, 6), (8.0, 8.0, 20.0), POSE)
     size = torch.tensor([[8.0, 8.0, 20.0]], dtype=torch.float64)
     points = transform_points(POSE, (1.2 + 1.6 * torch.rand(40, 3, dtype=torch.float64)) * size)
-    masses, phi = torch.rand(40, dtype=torch.float64), torch.rand(*grid.shape, 3, dtype=torch.float64)
-    carried = control_point_masses(grid, points, masses)
+    volumes, phi = torch.rand(40, dtype=torch.float64), torch.rand(*grid.shape, 3, dtype=torch.float64)
+    carried = control_point_volumes(grid, points, volumes)
     u = spline_displacement(grid, phi, points) @ POSE[:3, :3]
-    assert torch.allclose((carried[..., None] * phi).sum((0, 1, 2)), masses @ u)
+    assert torch.allclose((carried[..., None] * phi).sum((0, 1, 2)), volumes @ u)
 
 
 def test_what_lies_beyond_the_grid_counts_to_its_border():
     grid = ControlPointGrid((4, 4, 4), (10.0, 10.0, 10.0), torch.eye(4))
-    carried = control_point_masses(grid, torch.tensor([[500.0, 15.0, 15.0]]), torch.tensor([3.0]))
+    carried = control_point_volumes(grid, torch.tensor([[500.0, 15.0, 15.0]]), torch.tensor([3.0]))
     assert float(carried.sum()) == pytest.approx(3.0)
     assert (carried[:-1] == 0).all()
 
@@ -109,5 +109,5 @@ def test_impossible_clusterings_are_refused(loaded):
         cluster_control_points(grid, -weights, 2)
     with pytest.raises(ValueError, match="weights must be"):
         cluster_control_points(grid, 0 * weights, 2)
-    with pytest.raises(ValueError, match="masses must have shape"):
-        control_point_masses(grid, points, torch.ones(3))
+    with pytest.raises(ValueError, match="volumes must have shape"):
+        control_point_volumes(grid, points, torch.ones(3))

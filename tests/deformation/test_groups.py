@@ -8,12 +8,12 @@ from torchkcreg.deformation import (
     FreeFormDeformation,
     cluster_control_points,
     control_points_from_groups,
-    displacement_from_groups,
     group_centers,
     group_moment_gradients,
     group_moments,
     group_rigid_motions,
-    split_motions,
+    moment_features,
+    motion_coefficients,
 )
 from torchkcreg.geometry import rigid_matrix, rotation_from_vector, transform_points
 
@@ -21,7 +21,7 @@ POSE = rigid_matrix(
     torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64), torch.tensor([30.0, -5.0, 11.0], dtype=torch.float64)
 )
 GRID = ControlPointGrid((5, 5, 8), (8.75, 7.0, 25.0), POSE)
-FOUR, SEVEN = (cluster_control_points(GRID, torch.ones(GRID.shape), n) for n in (4, 7))
+FOUR = cluster_control_points(GRID, torch.ones(GRID.shape), 4)
 
 
 def random(*shape, seed=0):
@@ -49,8 +49,7 @@ def test_displacements_from_moments_are_those_of_the_spline_inside_and_beyond():
     rotations, translations = motions(4)
     phi = control_points_from_groups(GRID, FOUR, rotations, translations)
     points = around()
-    shares, moments = group_moments(GRID, FOUR, points)
-    u = GRID.to_implant(displacement_from_groups(shares, moments, rotations, translations))
+    u = GRID.to_implant(moment_features(GRID, FOUR, points) @ motion_coefficients(rotations, translations))
     assert torch.allclose(u, FreeFormDeformation(GRID, phi, FOUR).displacement(points), atol=1e-9)
     assert not GRID.contains(points).all() and GRID.contains(points).any()
 
@@ -73,24 +72,11 @@ def test_the_groups_motions_are_recovered_from_their_control_points():
     assert torch.allclose(moved, centers + translations, atol=1e-9)
 
 
-def test_a_split_of_groups_changes_nothing():
-    rotations, translations = motions(2, 4)
-    children = split_motions(GRID, FOUR, SEVEN, rotations, translations)
-    assert children[0].shape == (2, 7, 3, 3) and children[1].shape == (2, 7, 3)
-    before = control_points_from_groups(GRID, FOUR, rotations, translations)
-    assert torch.allclose(control_points_from_groups(GRID, SEVEN, *children), before, atol=1e-12)
-
-
-def test_a_split_that_is_none_is_refused():
-    with pytest.raises(ValueError, match="must refine"):
-        split_motions(GRID, SEVEN, FOUR, *motions(7))
-
-
 @pytest.mark.parametrize("leading", [(), (1,), (5,), (2, 3)])
 def test_candidates_are_worked_on_together(leading):
     rotations, translations = motions(*leading, 4)
     shares, moments = group_moments(GRID, FOUR, around(30))
-    u = displacement_from_groups(shares, moments, rotations, translations)
+    u = moment_features(GRID, FOUR, around(30)) @ motion_coefficients(rotations, translations)
     phi = control_points_from_groups(GRID, FOUR, rotations, translations)
     assert u.shape == (*leading, 30, 3) and phi.shape == (*leading, *GRID.shape, 3)
     last = tuple(n - 1 for n in leading)
@@ -101,9 +87,9 @@ def test_candidates_are_worked_on_together(leading):
 
 def test_gradients_reach_motions_and_points():
     rotations, translations = motions(2, 4)
-    shares, moments = group_moments(GRID, FOUR, around(6))
+    features = moment_features(GRID, FOUR, around(6))
     assert torch.autograd.gradcheck(
-        lambda r, t: displacement_from_groups(shares, moments, r, t),
+        lambda r, t: features @ motion_coefficients(r, t),
         (rotations.requires_grad_(), translations.requires_grad_()),
     )
     points = around(4).requires_grad_()

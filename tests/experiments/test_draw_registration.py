@@ -25,14 +25,14 @@ def texts(figure):
 
 
 def test_the_figures_are_those_of_a_run_folder(registered):
-    scene, data, result = registered
-    figures = draw_registration(result, scene, data, torch.eye(4, dtype=torch.float64))
+    _, data, result = registered
+    figures = draw_registration(result, data, [torch.eye(4, dtype=torch.float64)])
     assert list(figures) == ["overlay.png", "displacement.png", "history.png"]
 
 
 def test_the_overlay_shows_the_gradient_correlations_of_the_start_and_of_the_result(registered):
-    scene, data, result = registered
-    overlay = draw_registration(result, scene, data, torch.eye(4, dtype=torch.float64))["overlay.png"]
+    _, data, result = registered
+    overlay = draw_registration(result, data, [torch.eye(4, dtype=torch.float64)])["overlay.png"]
     written = [float(text.split()[1]) for text in texts(overlay) if text.startswith("GC")]
     before, after = written[:3], written[3:]
     assert after == pytest.approx(result.gc.tolist(), abs=0.01)
@@ -40,18 +40,18 @@ def test_the_overlay_shows_the_gradient_correlations_of_the_start_and_of_the_res
 
 
 def test_of_many_views_six_are_drawn(registered):
-    scene, data, result = registered
+    _, data, result = registered
     many = data.select([0, 1, 2] * 4)
-    overlay = draw_registration(result, scene, many, torch.eye(4, dtype=torch.float64))["overlay.png"]
+    overlay = draw_registration(result, many, [torch.eye(4, dtype=torch.float64)])["overlay.png"]
     assert len([text for text in texts(overlay) if text.startswith("GC")]) == 12
 
 
 def test_the_start_is_undeformed_and_leaves_the_scene_as_it_is(registered):
     scene, _, _ = registered
-    phi = scene.deformation.control_points.detach().clone()
+    phi = scene.assemblies[0].deformation.control_points.detach().clone()
     pose = torch.eye(4, dtype=torch.float64)
-    start = start_scene(scene, pose)
-    assert not start.deformation.control_points.any()
-    assert torch.equal(start.implant_to_world, pose)
+    start = start_scene(scene, [pose])
+    assert not start.assemblies[0].deformation.control_points.any()
+    assert torch.equal(start.assemblies[0].implant_to_world, pose)
     assert phi.any()
-    assert torch.equal(scene.deformation.control_points, phi)
+    assert torch.equal(scene.assemblies[0].deformation.control_points, phi)

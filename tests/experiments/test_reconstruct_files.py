@@ -108,16 +108,14 @@ def test_screws_that_a_registration_found_are_known_components(small_case, tmp_p
         geometry=small_case / "geometry.json",
         projections=small_case / "projections.npz",
     )
-    stages = [{"bin": 4, "iterations": 2, "oversampling": 1, "screws": "find"}]
+    stages = [{"bin": 4, "iterations": 2, "oversampling": 1, "before": ["find_screws"], "estimate": ["screws"]}]
     overrides = {"material": "steel", "pitch_mm": 1.0, "stages": stages}
     result = register_files(files, tmp_path / "run", overrides=overrides, figures=False)
     _, *screws = registered_components(tmp_path / "run")
-    assert len(screws) == len(result.screws) >= 1
-    for screw, found in zip(screws, result.screws, strict=True):
-        ends = torch.tensor([found["start"], found["end"]])
-        volume = torch.pi * found["radius"] ** 2 * (ends[1] - ends[0]).norm()
-        assert screw.material == found["material"]
-        assert screw.cloud.volume == pytest.approx(float(volume), rel=0.03)
+    assert len(screws) == len(result.screws_found) >= 1
+    for screw, found in zip(screws, result.screws_found, strict=True):
+        assert screw.material == found.material
+        assert screw.cloud.volume == pytest.approx(found.mesh().volume, rel=0.03)
     told = registered_components(tmp_path / "run", components=small_case / "screws.json")
     assert len(told) == 7
 

@@ -26,11 +26,11 @@ def _solids() -> dict[str, trimesh.Trimesh]:
 
 @pytest.mark.parametrize("name", _solids())
 @pytest.mark.parametrize("at_centroids", [False, True])
-def test_masses_add_up_to_the_volume_and_balance_at_its_centre(name: str, at_centroids: bool) -> None:
+def test_volumes_add_up_to_the_volume_and_balance_at_its_centre(name: str, at_centroids: bool) -> None:
     mesh = _solids()[name]
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5, at_centroids=at_centroids, dtype=torch.float64)
     assert cloud.volume == pytest.approx(mesh.volume, rel=1e-7)
-    center = (cloud.masses[:, None] * cloud.points).sum(0) / cloud.masses.sum()
+    center = (cloud.volumes[:, None] * cloud.points).sum(0) / cloud.volumes.sum()
     tolerance = 1e-4 if at_centroids else 0.02
     np.testing.assert_allclose(center.numpy(), mesh.center_mass, atol=tolerance)
 
@@ -38,7 +38,7 @@ def test_masses_add_up_to_the_volume_and_balance_at_its_centre(name: str, at_cen
 def test_the_moments_of_a_ball_are_those_of_the_ball() -> None:
     mesh = trimesh.creation.icosphere(5, 5.0)
     cloud = ImplantPointCloud.from_mesh(mesh, 0.25, at_centroids=True, dtype=torch.float64)
-    second = (cloud.masses[:, None, None] * cloud.points[:, :, None] * cloud.points[:, None]).sum(0) / cloud.volume
+    second = (cloud.volumes[:, None, None] * cloud.points[:, :, None] * cloud.points[:, None]).sum(0) / cloud.volume
     expected = torch.eye(3, dtype=torch.float64) * 25.0 / 5
     torch.testing.assert_close(second, expected, rtol=5e-3, atol=1e-3)
     assert cloud.volume == pytest.approx(4 / 3 * math.pi * 125, rel=2e-3)
@@ -50,7 +50,7 @@ def test_nodes_stand_at_the_centres_of_lattice_cells() -> None:
     in_cells = (cloud.points - torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)) / 0.4
     torch.testing.assert_close(in_cells - in_cells.floor(), torch.full_like(in_cells, 0.5), rtol=0, atol=1e-9)
     assert torch.equal(cloud.cell, 0.4 * torch.eye(3, dtype=torch.float64))
-    assert cloud.masses.max().item() == pytest.approx(0.4**3)
+    assert cloud.volumes.max().item() == pytest.approx(0.4**3)
     assert len(cloud.points.unique(dim=0)) == cloud.num_nodes
 
 
@@ -58,7 +58,7 @@ def test_a_box_between_lattice_planes_has_its_partial_volumes_at_the_faces() -> 
     cloud = ImplantPointCloud.from_mesh(trimesh.creation.box((1.2, 2.0, 3.0)), 0.5, dtype=torch.float64)
     outer = cloud.points[:, 0].abs() > 0.5
     expected = torch.where(outer, 0.125 * 0.2, 0.125).double()
-    torch.testing.assert_close(cloud.masses, expected)
+    torch.testing.assert_close(cloud.volumes, expected)
 
 
 def test_buffers_are_single_precision_by_default_and_follow_casts() -> None:
@@ -70,7 +70,7 @@ def test_buffers_are_single_precision_by_default_and_follow_casts() -> None:
 
 def test_a_cloud_reloads_from_its_state() -> None:
     cloud = ImplantPointCloud.from_mesh(trimesh.creation.box((2, 2, 2)), 0.5)
-    other = ImplantPointCloud(torch.zeros_like(cloud.points), torch.ones_like(cloud.masses), torch.eye(3))
+    other = ImplantPointCloud(torch.zeros_like(cloud.points), torch.ones_like(cloud.volumes), torch.eye(3))
     other.load_state_dict(cloud.state_dict())
     assert torch.equal(other.points, cloud.points) and torch.equal(other.cell, cloud.cell)
     assert repr(cloud) == "ImplantPointCloud(num_nodes=64, volume=8 mm^3, cell=0.5 x 0.5 x 0.5 mm)"
@@ -79,8 +79,8 @@ def test_a_cloud_reloads_from_its_state() -> None:
 def test_nodes_are_stored_as_neighbours_whatever_order_they_come_in() -> None:
     cloud = ImplantPointCloud.from_mesh(_solids()["turned box"], 0.5, at_centroids=False)
     shuffle = torch.randperm(cloud.num_nodes, generator=torch.Generator().manual_seed(0))
-    again = ImplantPointCloud(cloud.points[shuffle], cloud.masses[shuffle], cloud.cell)
-    assert torch.equal(again.points, cloud.points) and torch.equal(again.masses, cloud.masses)
+    again = ImplantPointCloud(cloud.points[shuffle], cloud.volumes[shuffle], cloud.cell)
+    assert torch.equal(again.points, cloud.points) and torch.equal(again.volumes, cloud.volumes)
     assert cloud.points.diff(dim=0).norm(dim=1).mean() < 2 * 0.5
 
 
@@ -89,10 +89,10 @@ def test_coarsening_keeps_mass_and_centre(factor: int) -> None:
     cloud = ImplantPointCloud.from_mesh(_solids()["washer"], 0.5, dtype=torch.float64)
     coarse = cloud.coarsened(factor)
     assert coarse.volume == pytest.approx(cloud.volume, rel=1e-12)
-    centers = [(c.masses[:, None] * c.points).sum(0) / c.volume for c in (cloud, coarse)]
+    centers = [(c.volumes[:, None] * c.points).sum(0) / c.volume for c in (cloud, coarse)]
     torch.testing.assert_close(*centers, rtol=0, atol=1e-9)
     assert torch.equal(coarse.cell, factor * cloud.cell)
-    assert (coarse.masses <= torch.linalg.det(coarse.cell) * (1 + 1e-9)).all()
+    assert (coarse.volumes <= torch.linalg.det(coarse.cell) * (1 + 1e-9)).all()
     if factor == 1:
         torch.testing.assert_close(coarse.points, cloud.points)
     if factor == 50:
@@ -102,7 +102,7 @@ def test_coarsening_keeps_mass_and_centre(factor: int) -> None:
 def test_inside_a_solid_coarse_nodes_form_a_coarse_lattice() -> None:
     coarse = ImplantPointCloud.from_mesh(trimesh.creation.box((4, 4, 4)), 0.25).coarsened(4)
     assert coarse.num_nodes == 64
-    torch.testing.assert_close(coarse.masses, torch.ones(64))
+    torch.testing.assert_close(coarse.volumes, torch.ones(64))
     torch.testing.assert_close(coarse.points - coarse.points.floor(), torch.full((64, 3), 0.5))
 
 
@@ -128,10 +128,10 @@ def test_a_volume_gives_one_node_a_voxel_above_the_threshold() -> None:
     world = grid.points(dtype=torch.float64)
     expected = {(1, 2, 3): 1.0, (2, 0, 4): 0.5}
     assert cloud.num_nodes == 2
-    for index, mass in expected.items():
+    for index, volume in expected.items():
         nearest = (cloud.points - world[index]).norm(dim=1).argmin()
         torch.testing.assert_close(cloud.points[nearest], world[index])
-        assert cloud.masses[nearest].item() == pytest.approx(mass)
+        assert cloud.volumes[nearest].item() == pytest.approx(volume)
     corner = transform_points(grid.voxel_to_world, torch.eye(3, dtype=torch.float64))
     torch.testing.assert_close(cloud.cell, corner - world[0, 0, 0])
 
@@ -142,7 +142,7 @@ def test_a_volume_of_partial_fractions_keeps_the_implants_volume() -> None:
     grid = VolumeGrid((120, 120, 120), 0.5, (-24.75, -24.75, -24.75))
     volume = torch.zeros(grid.shape, dtype=torch.float64)
     i, j, k = ((exact.points + 24.75) / 0.5).round().long().unbind(1)
-    volume[k, j, i] = 2.5 * exact.masses / 0.125
+    volume[k, j, i] = 2.5 * exact.volumes / 0.125
     cloud = ImplantPointCloud.from_volume(volume, grid, threshold=0.001, metal_value=2.5, dtype=torch.float64)
     assert cloud.volume == pytest.approx(mesh.volume, rel=1e-3)
 
@@ -151,7 +151,7 @@ def test_an_inverted_mesh_gives_the_same_cloud() -> None:
     mesh = trimesh.creation.icosphere(3, 3.0)
     expected = ImplantPointCloud.from_mesh(mesh, 0.5)
     mesh.invert()
-    torch.testing.assert_close(ImplantPointCloud.from_mesh(mesh, 0.5).masses, expected.masses)
+    torch.testing.assert_close(ImplantPointCloud.from_mesh(mesh, 0.5).volumes, expected.volumes)
 
 
 def test_meshes_that_are_no_solid_are_refused() -> None:
@@ -168,23 +168,23 @@ def test_meshes_that_are_no_solid_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("points", "masses", "cell", "message"),
+    ("points", "volumes", "cell", "message"),
     [
         (torch.zeros(0, 3), torch.zeros(0), torch.eye(3), "points"),
         (torch.zeros(4, 2), torch.zeros(4), torch.eye(3), "points"),
         (torch.full((4, 3), torch.inf), torch.zeros(4), torch.eye(3), "points"),
         (torch.zeros(4, 3, dtype=torch.int64), torch.zeros(4), torch.eye(3), "points"),
-        (torch.zeros(4, 3), torch.zeros(3), torch.eye(3), "masses"),
-        (torch.zeros(4, 3), -torch.ones(4), torch.eye(3), "masses"),
+        (torch.zeros(4, 3), torch.zeros(3), torch.eye(3), "volumes"),
+        (torch.zeros(4, 3), -torch.ones(4), torch.eye(3), "volumes"),
         (torch.zeros(4, 3), torch.ones(4), torch.eye(2), "cell"),
         (torch.zeros(4, 3), torch.ones(4), torch.zeros(3, 3), "cell"),
     ],
 )
 def test_what_is_no_cloud_is_refused(
-    points: torch.Tensor, masses: torch.Tensor, cell: torch.Tensor, message: str
+    points: torch.Tensor, volumes: torch.Tensor, cell: torch.Tensor, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        ImplantPointCloud(points, masses, cell)
+        ImplantPointCloud(points, volumes, cell)
 
 
 def test_volumes_without_metal_and_impossible_thresholds_are_refused() -> None:
@@ -206,7 +206,7 @@ def test_a_coarsened_cloud_is_made_once_and_again_when_the_nodes_change() -> Non
     coarse = cloud.coarsened(2)
     assert cloud.coarsened(2) is coarse and cloud.coarsened(4) is not coarse
     with torch.no_grad():
-        cloud.masses.mul_(0.5)
+        cloud.volumes.mul_(0.5)
     assert cloud.coarsened(2).volume == pytest.approx(coarse.volume / 2)
     assert cloud.double().coarsened(2).points.dtype == torch.float64
 

@@ -51,7 +51,7 @@ def test_what_lies_outside_the_grid_is_left_out() -> None:
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_a_cloud_keeps_volume_and_centre_and_stays_solid_inside(factor: int) -> None:
     cloud = ImplantPointCloud.from_mesh(_ball(), 0.4, at_centroids=True, dtype=torch.float64).coarsened(factor)
-    fractions = voxelize_points(cloud.points, cloud.masses, _grid(), cell=cloud.cell)
+    fractions = voxelize_points(cloud.points, cloud.volumes, _grid(), cell=cloud.cell)
     center, volume = _centre_and_volume(fractions, _grid())
     assert volume == pytest.approx(_ball().volume, rel=1e-9)
     np.testing.assert_allclose(center, [1.5, 2.0, 2.5], atol=1e-3)
@@ -63,13 +63,13 @@ def test_a_cloud_keeps_volume_and_centre_and_stays_solid_inside(factor: int) -> 
 def test_the_gradients_of_a_voxelised_cloud_are_right() -> None:
     grid = VolumeGrid.centered((3, 4, 5), 1.0)
     points = torch.tensor([[0.21, -0.3, 0.4], [1.1, 0.7, 0.11], [2.3, 0.1, 0.2]], dtype=torch.float64)
-    masses = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
-    inputs = (points.requires_grad_(), masses.requires_grad_())
+    volumes = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+    inputs = (points.requires_grad_(), volumes.requires_grad_())
     assert gradcheck(lambda p, m: voxelize_points(p, m, grid, cell=1.5 * torch.eye(3)), inputs)
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="points and masses"):
+    with pytest.raises(ValueError, match="points and volumes"):
         voxelize_points(torch.zeros(3, 3), torch.zeros(2), _grid())
     with pytest.raises(ValueError, match="mesh must be"):
         voxelize_mesh(torch.zeros(3, 3), _grid())

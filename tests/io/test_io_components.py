@@ -2,7 +2,8 @@ import json
 
 import pytest
 
-from torchkcreg.io import ComponentSpec, read_components, write_components
+from torchkcreg.implant import Screw
+from torchkcreg.io import read_components, write_components
 
 SCREW = {"from": [1, 2, 3], "to": [1, 2, -30], "radius": 2.0, "material": "steel", "fragment": "distal"}
 
@@ -16,13 +17,13 @@ def written(tmp_path, content):
 def test_cylinders_are_read_with_names_by_number(tmp_path):
     specs = read_components(written(tmp_path, {"units": "mm", "screws": [SCREW, {**SCREW, "name": "tip"}]}))
     assert specs == [
-        ComponentSpec((1.0, 2.0, 3.0), (1.0, 2.0, -30.0), 2.0, "steel", "screw0"),
-        ComponentSpec((1.0, 2.0, 3.0), (1.0, 2.0, -30.0), 2.0, "steel", "tip"),
+        Screw((1.0, 2.0, 3.0), (1.0, 2.0, -30.0), 2.0, "steel", "screw0"),
+        Screw((1.0, 2.0, 3.0), (1.0, 2.0, -30.0), 2.0, "steel", "tip"),
     ]
 
 
 def test_cylinders_come_back_as_they_were_written(tmp_path):
-    specs = [ComponentSpec((0.1, 0.2, 0.3), (4.0, 5.0, 6.0), 1.25, "titanium", "a")]
+    specs = [Screw((0.1, 0.2, 0.3), (4.0, 5.0, 6.0), 1.25, "titanium", "a")]
     write_components(tmp_path / "screws.json", specs)
     assert read_components(tmp_path / "screws.json") == specs
 

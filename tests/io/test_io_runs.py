@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torchkcreg.deformation import ControlPointGrid, FreeFormDeformation
 from torchkcreg.geometry import rigid_matrix, transform_points
 from torchkcreg.io import RunFolder, read_config, read_run, result_from_dict, result_to_dict
-from torchkcreg.registration import RegistrationConfig, RegistrationResult
+from torchkcreg.registration import RegisteredImplant, RegistrationConfig, RegistrationResult
 
 RESULT_FILES = {"deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply", "history.json"}
 
@@ -26,15 +26,14 @@ def result():
         (torch.arange(7) // 3).expand(shape),
     )
     pose = rigid_matrix(torch.tensor([0.1, -0.2, 0.3]).double(), torch.tensor([1.0, 2.0, 3.0]).double())
+    implant = RegisteredImplant("plate", pose, deformation, components={"screw0": pose.inverse()})
     return RegistrationResult(
-        implant_to_world=pose,
-        deformation=deformation,
+        implants=[implant],
         gc=torch.tensor([0.75, 0.5]),
         history=[{"stage": 0, "iteration": 1, "loss": 0.25}],
         config=RegistrationConfig(beta=0.5, seed=7),
         seed=7,
         warnings=["few views"],
-        components={"screw0": pose.inverse()},
         intensity={"scatter": 0.0625},
     )
 
@@ -50,7 +49,7 @@ def names(path):
 
 def test_a_result_comes_back_and_warps_every_point_as_before(tmp_path, result, points):
     run = RunFolder.create(tmp_path / "run")
-    run.write_result(result, points)
+    run.write_result(result, [points])
     again = read_run(tmp_path / "run")
     assert not result.outside(points).all()
     assert result.outside(points).any()
@@ -66,7 +65,7 @@ def test_a_result_comes_back_and_warps_every_point_as_before(tmp_path, result, p
 
 def test_the_files_of_a_result_agree_with_each_other(tmp_path, result, points):
     run = RunFolder.create(tmp_path)
-    run.write_result(result, points)
+    run.write_result(result, [points])
     assert names(tmp_path) == RESULT_FILES
     cloud = np.asarray(trimesh.load(tmp_path / "implant_deformed.ply").vertices)
     assert cloud == pytest.approx(result.warp(points).numpy(), abs=1e-4)
@@ -81,10 +80,10 @@ def test_displacements_of_the_cloud_count_from_the_initial_pose(tmp_path, result
     run = RunFolder.create(tmp_path)
     with torch.no_grad():
         result.deformation.control_points.zero_()
-    run.write_result(result, points, initial_to_world=result.implant_to_world)
+    run.write_result(result, [points], initial_to_world=[result.implant_to_world])
     fields = trimesh.load(tmp_path / "implant_deformed.ply").metadata["_ply_raw"]["vertex"]["data"]
     assert np.abs(fields["displacement"]).max() < 1e-5
-    run.write_result(result, points)
+    run.write_result(result, [points])
     fields = trimesh.load(tmp_path / "implant_deformed.ply").metadata["_ply_raw"]["vertex"]["data"]
     expected = (transform_points(result.implant_to_world, points) - points).norm(dim=-1)
     assert fields["displacement"].ravel() == pytest.approx(expected.numpy(), rel=1e-5)
@@ -94,18 +93,18 @@ def test_a_result_that_diverged_is_refused_and_nothing_is_written(tmp_path, resu
     with torch.no_grad():
         result.deformation.control_points[0, 0, 0, 0] = float("nan")
     with pytest.raises(ValueError, match="control_points must be finite"):
-        RunFolder.create(tmp_path).write_result(result, points)
+        RunFolder.create(tmp_path).write_result(result, [points])
     assert names(tmp_path) == set()
 
 
 def test_a_write_that_fails_halfway_leaves_a_run_that_is_not_finished(tmp_path, result, points):
     run = RunFolder.create(tmp_path)
     run.start({})
-    run.write_result(result, points)
+    run.write_result(result, [points])
     (tmp_path / "bspline.tfm").unlink()
     (tmp_path / "bspline.tfm").mkdir()
     with pytest.raises(IsADirectoryError, match=r"bspline\.tfm is a folder"):
-        run.write_result(result, points)
+        run.write_result(result, [points])
     assert not any(name.startswith(".") for name in names(tmp_path))
     with pytest.raises(FileNotFoundError, match=r"is not finished: it has no deformation\.json"):
         read_run(tmp_path)
@@ -136,7 +135,7 @@ def test_a_resumed_run_keeps_its_files(tmp_path):
 def test_overwriting_discards_the_run_and_nothing_else(tmp_path, result, points):
     run = RunFolder.create(tmp_path)
     run.start({})
-    run.write_result(result, points)
+    run.write_result(result, [points])
     run.save_checkpoint({"a": 1})
     (tmp_path / "notes.txt").write_text("mine")
     RunFolder.create(tmp_path, overwrite=True)
@@ -224,32 +223,44 @@ def test_a_folder_without_a_run_says_so(tmp_path):
         read_run(tmp_path)
 
 
-def drop(key):
-    return lambda content: content.pop(key)
+def bending(content):
+    return content["implants"][0]["deformation"]
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda c: c.update(format="other"), "must be a 'torchkcreg deformation', got 'other'"),
-        (lambda c: c.update(format_version=99), "format_version must be 1, got 99"),
-        (drop("grid"), "'grid' is missing"),
-        (lambda c: c["grid"].pop("spacing_mm"), "grid must have shape, spacing_mm and grid_to_implant"),
-        (lambda c: c["control_points_mm"].pop(), "control_points_mm must be 5 x 5 x 7 x 3 numbers"),
-        (lambda c: c.update(implant_to_world=[[1.0]]), "implant_to_world must be 4 x 4 numbers"),
-        (lambda c: c.update(labels=0), "labels must be 5 x 5 x 7 numbers"),
+        (lambda c: c.update(format_version=99), "format_version must be at most 2, got 99"),
+        (lambda c: bending(c).pop("grid"), "'grid' of a deformation is missing"),
+        (lambda c: bending(c).update(model="jelly"), "model must be one of ffd, rigid, got 'jelly'"),
+        (lambda c: bending(c)["grid"].pop("spacing_mm"), "'spacing_mm' of the grid is missing"),
+        (lambda c: bending(c)["control_points_mm"].pop(), "control_points_mm must be 5 x 5 x 7 x 3 numbers"),
+        (lambda c: c["implants"][0].update(implant_to_world=[[1.0]]), "implant_to_world must be 4 x 4 numbers"),
+        (lambda c: bending(c).update(labels=0), "labels must be 5 x 5 x 7 numbers"),
         (lambda c: c["config"].update(colour="green"), "colour"),
-        (lambda c: c["components"].update(screw0=1), "motion of component screw0 must be 4 x 4"),
+        (lambda c: c["implants"][0]["components"].update(screw0=1), "motion of component screw0 must be 4 x 4"),
     ],
 )
 def test_a_damaged_result_is_refused_in_one_line_that_names_the_key(tmp_path, result, points, spoil, message):
-    RunFolder.create(tmp_path).write_result(result, points)
+    RunFolder.create(tmp_path).write_result(result, [points])
     content = json.loads((tmp_path / "deformation.json").read_text())
     spoil(content)
     (tmp_path / "deformation.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=rf"^deformation file .*deformation\.json: .*{message}") as caught:
         read_run(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_result_of_the_first_format_is_read_too(result, points):
+    content = json.loads(json.dumps(result_to_dict(result)))
+    (implant,) = content.pop("implants")
+    own = {key: value for key, value in bending({"implants": [implant]}).items() if key != "model"}
+    screw = {"start": [0.0, 0.0, 0.0], "end": [0.0, 0.0, 9.0], "radius": 1.5, "material": "steel"}
+    old = {"implant_to_world": implant["implant_to_world"], "components": implant["components"]}
+    again = result_from_dict({**content, **own, **old, "screws_found": [screw], "format_version": 1})
+    torch.testing.assert_close(again.warp(points), result.warp(points), rtol=0, atol=1e-12)
+    assert [s.name for s in again.screws_found] == ["found0"] and again.screws_found[0].length == 9.0
 
 
 def test_a_view_without_a_similarity_stays_unknown(result):

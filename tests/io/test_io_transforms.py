@@ -70,7 +70,7 @@ def test_a_single_precision_deformation_is_written_as_well(pose, deformation):
 
 
 def test_each_voxel_of_the_field_leads_where_the_deformation_leads_also_beyond_the_grid(pose, deformation):
-    field = displacement_field(pose, deformation, spacing_mm=9.0, margin_mm=20.0)
+    field = displacement_field(pose, deformation, inside(deformation), spacing_mm=9.0, margin_mm=20.0)
     indices = [(0, 0, 0), (1, 2, 3), (3, 1, 9), tuple(n - 1 for n in field.GetSize())]
     points = torch.tensor([field.TransformIndexToPhysicalPoint(index) for index in indices], dtype=torch.float64)
     vectors = torch.tensor([field[index] for index in indices], dtype=torch.float64)
@@ -79,7 +79,7 @@ def test_each_voxel_of_the_field_leads_where_the_deformation_leads_also_beyond_t
 
 
 def test_the_field_covers_the_valid_domain_and_its_margin(pose, deformation):
-    field = displacement_field(pose, deformation, spacing_mm=3.0, margin_mm=7.0)
+    field = displacement_field(pose, deformation, inside(deformation), spacing_mm=3.0, margin_mm=7.0)
     assert max(field.GetSpacing()) <= 3.0
     reached = [(n - 1) * s for n, s in zip(field.GetSize(), field.GetSpacing())]
     assert reached == pytest.approx([2 * 8.75 + 14, 3 * 6.0 + 14, 5 * 25.0 + 14])
@@ -90,7 +90,7 @@ def test_the_field_covers_the_valid_domain_and_its_margin(pose, deformation):
 def test_a_field_from_a_file_moves_points_as_the_deformation_does(tmp_path, pose, deformation):
     with torch.no_grad():
         deformation.control_points.mul_(0.2)
-    write_displacement_field(tmp_path / "dvf.mha", pose, deformation)
+    write_displacement_field(tmp_path / "dvf.mha", pose, deformation, inside(deformation))
     image = sitk.ReadImage(str(tmp_path / "dvf.mha"), sitk.sitkVectorFloat64)
     points = inside(deformation, 100)
     moved = by_itk(sitk.DisplacementFieldTransform(image), points)
@@ -101,7 +101,7 @@ def test_a_field_from_a_file_moves_points_as_the_deformation_does(tmp_path, pose
 def test_writing_leaves_the_deformation_as_it_was(tmp_path, pose, deformation):
     deformation.float()
     before = deformation.control_points.detach().clone()
-    write_displacement_field(tmp_path / "dvf.mha", pose, deformation)
+    write_displacement_field(tmp_path / "dvf.mha", pose, deformation, inside(deformation))
     write_itk_transform(tmp_path / "bspline.tfm", pose, deformation)
     assert deformation.control_points.dtype == torch.float32
     assert torch.equal(deformation.control_points, before)

@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from torchkcreg.geometry import MultisourceScanner, VolumeGrid
+from torchkcreg.implant import Screw
 from torchkcreg.io import (
-    ComponentSpec,
     read_components,
     read_config,
     read_geometry,
@@ -88,7 +88,7 @@ READERS: dict[str, Reader] = {
     "spectrum": ("s.csv", lambda p: write_spectrum(p, tungsten_spectrum(70)), read_spectrum),
     "components": (
         "c.json",
-        lambda p: write_components(p, [ComponentSpec((0.0, 0.0, 0.0), (0.0, 9.0, 0.0), 1.5, "steel", "a")]),
+        lambda p: write_components(p, [Screw((0.0, 0.0, 0.0), (0.0, 9.0, 0.0), 1.5, "steel", "a")]),
         read_components,
     ),
     "init": ("i.json", lambda p: write_init(p, torch.eye(4, dtype=torch.float64)), read_init),

@@ -25,11 +25,11 @@ def some_nodes(*, dtype=torch.float64, candidates=2, num_blocks=3, scale=1.0, st
     if strewn:
         points = points[torch.randperm(len(points), generator=generator)]
     shifts = torch.randn(candidates, 1, 3, dtype=torch.float64, generator=generator)
-    masses = torch.rand(len(points), dtype=torch.float64, generator=generator)
+    volumes = torch.rand(len(points), dtype=torch.float64, generator=generator)
     matrices = torch.cat([camera(a, det_shape=SHAPE, source_z=z) for a, z in ((10, 120.0), (50, 0.0), (95, -120.0))])
     block_size = -(-len(points) // num_blocks) + 7
     footprint = cell_footprint(points, scale * CELL @ turn.T, matrices, block_size=block_size)
-    tensors = [t.to(dtype) for t in (points + shifts, masses * 1e4, matrices, footprint.table)]
+    tensors = [t.to(dtype) for t in (points + shifts, volumes * 1e4, matrices, footprint.table)]
     return *tensors, block_size, *SHAPE
 
 
@@ -40,12 +40,12 @@ def few_nodes(dtype=torch.float64):
     points[0, 0] = torch.tensor([500.0, 0, 0])
     matrices = torch.cat([camera(10, det_shape=(9, 12)), camera(95, det_shape=(9, 12))])
     table = cell_footprint(points, CELL @ rotation((1, 2, 3), 30), matrices, block_size=3).table
-    masses = torch.rand(7, dtype=torch.float64, generator=generator)
-    return [t.to(dtype) for t in (points, masses, matrices, table)] + [3, 9, 12]
+    volumes = torch.rand(7, dtype=torch.float64, generator=generator)
+    return [t.to(dtype) for t in (points, volumes, matrices, table)] + [3, 9, 12]
 
 
 def gradients(arguments, backend):
-    """Gradients to points, masses and matrices of a sum with random signs."""
+    """Gradients to points, volumes and matrices of a sum with random signs."""
     leaves = [t.clone().requires_grad_() for t in arguments[:3]]
     image = point_drr(*leaves, *arguments[3:], backend=backend)
     weight = torch.randn(image.shape, dtype=image.dtype, generator=torch.Generator().manual_seed(5))
@@ -88,11 +88,11 @@ def test_gradients_of_the_operator_are_those_of_finite_differences(backend):
 
 @pytest.mark.parametrize("backend", ["cpp", "torch"])
 def test_gradients_of_project_points_are_those_of_finite_differences(backend):
-    points, masses, matrices, _, block_size, rows, cols = few_nodes()
+    points, volumes, matrices, _, block_size, rows, cols = few_nodes()
     footprint = cell_footprint(points, CELL, matrices, block_size=block_size)
     assert torch.autograd.gradcheck(
         lambda *t: summaries(project_points(*t, (rows, cols), footprint=footprint, backend=backend)),
-        [t.requires_grad_() for t in (points, masses, matrices)],
+        [t.requires_grad_() for t in (points, volumes, matrices)],
         eps=1e-6,
         atol=1e-5,
     )
@@ -108,13 +108,13 @@ def test_operators_pass_opcheck(dtype):
         torch.library.opcheck(torch.ops.torchkcreg.point_drr_backward, (grad, *arguments[:5], *needs))
 
 
-def test_projection_and_gradient_of_the_masses_are_adjoint():
-    points, masses, *rest = some_nodes()
+def test_projection_and_gradient_of_the_volumes_are_adjoint():
+    points, volumes, *rest = some_nodes()
     y = torch.randn(2, 3, *SHAPE, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    leaf = masses.clone().requires_grad_()
+    leaf = volumes.clone().requires_grad_()
     image = point_drr(points, leaf, *rest, backend="cpp")
     (back,) = torch.autograd.grad(image, leaf, y)
-    torch.testing.assert_close((image * y).sum(), (masses * back).sum(), rtol=1e-12, atol=0)
+    torch.testing.assert_close((image * y).sum(), (volumes * back).sum(), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -148,11 +148,11 @@ def test_blocks_longer_than_a_chunk_are_drawn_whole():
 
 
 def test_memory_layout_does_not_matter():
-    points, masses, matrices, table, *rest = some_nodes()
-    expected = point_drr(points, masses, matrices, table, *rest, backend="cpp")
+    points, volumes, matrices, table, *rest = some_nodes()
+    expected = point_drr(points, volumes, matrices, table, *rest, backend="cpp")
     turned = point_drr(
         points.mT.contiguous().mT,
-        torch.stack([masses, masses], 1)[:, 0],
+        torch.stack([volumes, volumes], 1)[:, 0],
         matrices.mT.contiguous().mT,
         table.transpose(-1, 0).contiguous().transpose(-1, 0),
         *rest,
@@ -162,20 +162,20 @@ def test_memory_layout_does_not_matter():
 
 
 def test_only_needed_gradients_are_computed():
-    points, masses, matrices, table, block_size, *_ = some_nodes()
+    points, volumes, matrices, table, block_size, *_ = some_nodes()
     grad = torch.ones(2, 3, *SHAPE, dtype=torch.float64)
     backward = torch.ops.torchkcreg.point_drr_backward
-    everything = backward(grad, points, masses, matrices, table, block_size, True, True)
-    points_only = backward(grad, points, masses, matrices, table, block_size, False, False)
+    everything = backward(grad, points, volumes, matrices, table, block_size, True, True)
+    points_only = backward(grad, points, volumes, matrices, table, block_size, False, False)
     assert [g.numel() for g in points_only[1:]] == [0, 0]
     torch.testing.assert_close(points_only[0], everything[0], rtol=1e-12, atol=1e-12)
 
 
 def test_nothing_to_draw_gives_empty_images():
-    points, masses, matrices, table, *rest = some_nodes()
+    points, volumes, matrices, table, *rest = some_nodes()
     for backend in ("cpp", "torch"):
-        assert point_drr(points[:0], masses, matrices, table, *rest, backend=backend).shape == (0, 3, *SHAPE)
-        assert point_drr(points, masses, matrices[:0], table[:0], *rest, backend=backend).shape == (2, 0, *SHAPE)
+        assert point_drr(points[:0], volumes, matrices, table, *rest, backend=backend).shape == (0, 3, *SHAPE)
+        assert point_drr(points, volumes, matrices[:0], table[:0], *rest, backend=backend).shape == (2, 0, *SHAPE)
 
 
 def test_kernels_check_shapes_themselves():

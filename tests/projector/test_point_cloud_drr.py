@@ -13,7 +13,7 @@ CELL = PITCH * torch.eye(3, dtype=torch.float64)
 SHAPE = (96, 96)
 
 
-def masses_of(points: torch.Tensor, pitch: float = PITCH) -> torch.Tensor:
+def volumes_of(points: torch.Tensor, pitch: float = PITCH) -> torch.Tensor:
     return torch.full((points.shape[-2],), pitch**3, dtype=points.dtype)
 
 
@@ -22,7 +22,7 @@ def box_drr(size, turn, *, dtype=torch.float32, block_size=8192, **camera_option
     matrices = camera(det_shape=SHAPE, **camera_options)
     points = (lattice(size) @ turn.T).to(dtype)
     footprint = cell_footprint(points, CELL @ turn.T, matrices, block_size=block_size)
-    image = project_points(points, masses_of(points), matrices, SHAPE, footprint=footprint)[0].double()
+    image = project_points(points, volumes_of(points), matrices, SHAPE, footprint=footprint)[0].double()
     source, directions = rays(matrices[0], SHAPE)
     return image, box_chords(source @ turn, directions @ turn, size), matrices
 
@@ -69,7 +69,7 @@ def test_stripes_stay_away_while_a_footprint_is_reused_for_poses_a_few_degrees_o
     points = lattice(size)
     footprint = cell_footprint(points @ turn.T, CELL @ turn.T, matrices)
     turn = rotation((1, -1, 2), 4) @ turn
-    image = project_points(points @ turn.T, masses_of(points), matrices, SHAPE, footprint=footprint)[0]
+    image = project_points(points @ turn.T, volumes_of(points), matrices, SHAPE, footprint=footprint)[0]
     source, directions = rays(matrices[0], SHAPE)
     chords = box_chords(source @ turn, directions @ turn, size)
     assert (image / chords)[interior_of_slab(size, turn, matrices[0])].std() < 0.003
@@ -93,8 +93,8 @@ def test_a_sphere_with_partial_volumes_has_its_chords():
     sub = (torch.arange(5, dtype=torch.float64) - 2) / 5 * PITCH
     inside = ((points[:, None] + torch.cartesian_prod(sub, sub, sub)).norm(dim=-1) < radius).double().mean(1)
     kept = inside > 0
-    points, masses = points[kept], inside[kept] * PITCH**3
-    image = project_points(points, masses, matrices, SHAPE, cell=CELL)[0]
+    points, volumes = points[kept], inside[kept] * PITCH**3
+    image = project_points(points, volumes, matrices, SHAPE, cell=CELL)[0]
     source, directions = rays(matrices[0], SHAPE)
     distance = torch.linalg.cross(directions, (-source).expand_as(directions)).norm(dim=-1)
     chords = 2 * (radius**2 - distance**2).clamp(min=0).sqrt()
@@ -108,14 +108,14 @@ def test_a_sphere_with_partial_volumes_has_its_chords():
 def test_no_mass_is_lost(backend):
     matrices = camera(33, det_shape=SHAPE, source_z=-70.0)
     points = lattice((3, 3, 3)) @ rotation((1, 2, 0), 20).T
-    masses = torch.rand(len(points), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    image = project_points(points, masses, matrices, SHAPE, cell=CELL, backend=backend)[0]
+    volumes = torch.rand(len(points), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    image = project_points(points, volumes, matrices, SHAPE, cell=CELL, backend=backend)[0]
     linear = matrices[0, :, :3]
     v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in SHAPE), indexing="ij")
     ray = torch.stack([u, v, torch.ones_like(u)], dim=-1) @ torch.linalg.inv(linear).T
     depth = points @ matrices[0, 2, :3] + matrices[0, 2, 3]
     total = (image / (linear.det().abs() * ray.norm(dim=-1))).sum()
-    torch.testing.assert_close(total, (masses / depth**2).sum(), rtol=1e-12, atol=0)
+    torch.testing.assert_close(total, (volumes / depth**2).sum(), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("backend", ["cpp", "torch"])
@@ -123,8 +123,8 @@ def test_a_footprint_that_leaves_the_detector_loses_just_that_part(backend):
     points = lattice((2, 12, 12)) @ rotation((1, 2, 3), 25).T
     row, col = 370, 375  # the body covers pixels around (383, 383) of the large detector
     options = {"cell": CELL, "backend": backend}
-    large = project_points(points, masses_of(points), camera(10, first_pixel=(340, 340)), (90, 90), **options)
-    small = project_points(points, masses_of(points), camera(10, first_pixel=(row, col)), (15, 20), **options)
+    large = project_points(points, volumes_of(points), camera(10, first_pixel=(340, 340)), (90, 90), **options)
+    small = project_points(points, volumes_of(points), camera(10, first_pixel=(row, col)), (15, 20), **options)
     expected = large[:, row - 340 : row - 325, col - 340 : col - 320]
     assert (expected[0, 0] > 1).any() and (expected[0, :, 0] > 1).any() and (expected[0, -1] > 1).any()
     torch.testing.assert_close(small, expected, rtol=1e-9, atol=1e-9)
@@ -139,9 +139,11 @@ def test_a_footprint_that_leaves_the_detector_loses_just_that_part(backend):
 def test_a_node_that_cannot_be_seen_changes_nothing(stray, backend):
     points = lattice((2, 2, 2))
     footprint = cell_footprint(points, CELL, camera(0))
-    alone = project_points(points, masses_of(points), camera(0), (64, 64), footprint=footprint, backend=backend)
+    alone = project_points(points, volumes_of(points), camera(0), (64, 64), footprint=footprint, backend=backend)
     with_stray = torch.cat([points, torch.tensor([stray], dtype=torch.float64)]).requires_grad_()
-    image = project_points(with_stray, masses_of(with_stray), camera(0), (64, 64), footprint=footprint, backend=backend)
+    image = project_points(
+        with_stray, volumes_of(with_stray), camera(0), (64, 64), footprint=footprint, backend=backend
+    )
     torch.testing.assert_close(image, alone, rtol=1e-12, atol=1e-12)
     image.square().sum().backward()
     assert with_stray.grad.isfinite().all()
@@ -153,10 +155,10 @@ def test_moving_the_implant_is_moving_the_gantry_back():
     points = lattice((3, 5, 7))
     turn, shift = rotation((1, 2, 3), 25), torch.tensor([3.0, -2, 5], dtype=torch.float64)
     matrices = torch.cat([camera(20, det_shape=SHAPE), camera(100, det_shape=SHAPE, source_z=120.0)])
-    moved_points = project_points(points @ turn.T + shift, masses_of(points), matrices, SHAPE, cell=CELL @ turn.T)
+    moved_points = project_points(points @ turn.T + shift, volumes_of(points), matrices, SHAPE, cell=CELL @ turn.T)
     rigid = torch.eye(4, dtype=torch.float64)
     rigid[:3, :3], rigid[:3, 3] = turn, shift
-    moved_gantry = project_points(points, masses_of(points), matrices @ rigid, SHAPE, cell=CELL)
+    moved_gantry = project_points(points, volumes_of(points), matrices @ rigid, SHAPE, cell=CELL)
     assert moved_points.max() > 2
     torch.testing.assert_close(moved_points, moved_gantry, rtol=1e-9, atol=1e-9)
 
@@ -165,8 +167,8 @@ def test_mirrored_and_rescaled_matrices_describe_their_own_images():
     points = lattice((3, 5, 7)) + 1.5
     matrices = camera(20, det_shape=SHAPE)
     flip = torch.tensor([[-1.0, 0, SHAPE[1] - 1], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
-    image = project_points(points, masses_of(points), matrices, SHAPE, cell=CELL)
-    mirrored = project_points(points, masses_of(points), flip @ matrices, SHAPE, cell=CELL)
+    image = project_points(points, volumes_of(points), matrices, SHAPE, cell=CELL)
+    mirrored = project_points(points, volumes_of(points), flip @ matrices, SHAPE, cell=CELL)
     torch.testing.assert_close(mirrored, image.flip(-1), rtol=1e-9, atol=1e-9)
 
 
@@ -175,11 +177,11 @@ def test_candidates_are_projected_each_by_itself():
     shifts = torch.randn(2, 3, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     matrices = torch.cat([camera(20), camera(50, source_z=120.0)])
     footprint = cell_footprint(points, CELL, matrices)
-    images = project_points(points + shifts, masses_of(points), matrices, (64, 64), footprint=footprint)
+    images = project_points(points + shifts, volumes_of(points), matrices, (64, 64), footprint=footprint)
     assert images.shape == (2, 3, 2, 64, 64)
     for i in range(2):
         for j in range(3):
-            alone = project_points(points + shifts[i, j], masses_of(points), matrices, (64, 64), footprint=footprint)
+            alone = project_points(points + shifts[i, j], volumes_of(points), matrices, (64, 64), footprint=footprint)
             assert torch.equal(images[i, j], alone)
 
 
@@ -187,8 +189,8 @@ def test_candidates_are_projected_each_by_itself():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_images_have_the_dtype_of_the_points(dtype, matrix_dtype):
     points = lattice((2, 3, 4))
-    exact = project_points(points, masses_of(points), camera(20), (64, 64), cell=CELL)
-    image = project_points(points.to(dtype), masses_of(points), camera(20).to(matrix_dtype), (64, 64), cell=CELL)
+    exact = project_points(points, volumes_of(points), camera(20), (64, 64), cell=CELL)
+    image = project_points(points.to(dtype), volumes_of(points), camera(20).to(matrix_dtype), (64, 64), cell=CELL)
     assert image.dtype == dtype
     torch.testing.assert_close(image.double(), exact, rtol=0, atol=2e-3)
 
@@ -197,10 +199,10 @@ def test_projector_module_takes_any_geometry():
     points = lattice((2, 3, 4))
     geometry = SimpleNamespace(projection_matrices=camera(20), det_shape=(64, 64))
     projector = PointCloudProjector(geometry, backend="torch")
-    expected = project_points(points, masses_of(points), camera(20), (64, 64), cell=CELL, backend="torch")
-    assert torch.equal(projector(points, masses_of(points), cell=CELL), expected)
+    expected = project_points(points, volumes_of(points), camera(20), (64, 64), cell=CELL, backend="torch")
+    assert torch.equal(projector(points, volumes_of(points), cell=CELL), expected)
     footprint = cell_footprint(points, CELL, camera(20))
-    assert torch.equal(projector(points, masses_of(points), footprint=footprint), expected)
+    assert torch.equal(projector(points, volumes_of(points), footprint=footprint), expected)
     assert "torch" in repr(projector)
 
 
@@ -222,9 +224,9 @@ POINTS = torch.zeros(4, 3)
         ({"points": torch.zeros(4, 2)}, r"points must have shape \(\.\.\., N, 3\)"),
         ({"points": torch.zeros(4, 3, dtype=torch.int64)}, "points must be float32 or float64"),
         ({"points": torch.zeros(4, 3, dtype=torch.float16)}, "points must be float32 or float64"),
-        ({"masses": torch.ones(5)}, r"masses must have shape \(4,\)"),
-        ({"masses": torch.ones(4, dtype=torch.int32)}, "masses must be floating point"),
-        ({"masses": torch.ones(4, device="meta")}, "masses must be on the points' device"),
+        ({"volumes": torch.ones(5)}, r"volumes must have shape \(4,\)"),
+        ({"volumes": torch.ones(4, dtype=torch.int32)}, "volumes must be floating point"),
+        ({"volumes": torch.ones(4, device="meta")}, "volumes must be on the points' device"),
         ({"projection_matrices": torch.zeros(3, 4)}, r"projection_matrices must have shape \(V, 3, 4\)"),
         ({"det_shape": (0, 5)}, "det_shape must be"),
         ({"cell": None}, "either cell or footprint"),
@@ -237,7 +239,7 @@ POINTS = torch.zeros(4, 3)
 def test_wrong_input_is_named(change, message):
     arguments = {
         "points": POINTS,
-        "masses": torch.ones(4),
+        "volumes": torch.ones(4),
         "projection_matrices": camera(0),
         "det_shape": (8, 8),
         "cell": CELL,

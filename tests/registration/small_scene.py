@@ -8,13 +8,14 @@ from torch import Tensor
 
 from torchkcreg.deformation import (
     cluster_control_points,
-    control_point_masses,
+    control_point_volumes,
     control_points_from_groups,
     group_centers,
 )
 from torchkcreg.geometry import circular_geometry, rigid_matrix, rotation_from_vector
 from torchkcreg.implant import Component, ImplantPointCloud
-from torchkcreg.registration import RegistrationConfig, RegistrationData, Scene, Stage, StageModel, build_scene
+from torchkcreg.registration import Objective, RegistrationConfig, Stage, StageRun, build_scene
+from torchkcreg.scene import RegistrationData, Scene
 from torchkcreg.simulation import locking_plate
 
 SCREW = Component.screw("screw", (2.0, 2.0, 15.0), (2.0, -14.0, 15.0), 1.5, pitch=0.5)
@@ -58,27 +59,30 @@ def scene(config: RegistrationConfig, implant_to_world: Tensor | None = None, co
     return build_scene(plate(), config, implant_to_world=implant_to_world, components=components)
 
 
-def image(of: Scene, config: RegistrationConfig, background: Tensor | None = None) -> RegistrationData:
+def image(of: Scene, background: Tensor | None = None) -> RegistrationData:
     """What the views show of a scene."""
     views = geometry()
     blank = RegistrationData(views, torch.zeros(views.num_views, *views.det_shape), background=background)
-    stage = Stage(groups=min(3, config.schedule()[-1].groups), margin_mm=None, oversampling=2)
-    model = StageModel(of, blank, stage, config)
     with torch.no_grad():
-        lines = model.line_integrals(torch.zeros(1, model.num_parameters, dtype=torch.float64))[0]
-    return RegistrationData(views, lines)
+        return RegistrationData(views, of(of.view(blank)))
+
+
+def objective(of: Scene, data: RegistrationData, stage: Stage, config: RegistrationConfig) -> Objective:
+    """Of a stage at the scene's present state, without the steps before it."""
+    return StageRun(of, data, stage, config).objective
 
 
 def bend(of: Scene, radians: float) -> None:
     """Turns the upper third of the plate out of its plane."""
-    grid = of.deformation.grid
-    labels = cluster_control_points(grid, control_point_masses(grid, of.implant.points, of.implant.masses), 3)
+    (assembly,) = of.assemblies
+    grid, implant = assembly.deformation.grid, assembly.implant
+    labels = cluster_control_points(grid, control_point_volumes(grid, implant.points, implant.volumes), 3)
     vectors = torch.zeros(3, 3, dtype=torch.float64)
     vectors[group_centers(grid, labels)[:, 2].argmax(), 1] = radians
     motions = rotation_from_vector(vectors), torch.zeros(3, 3, dtype=torch.float64)
     with torch.no_grad():
-        of.deformation.control_points.copy_(control_points_from_groups(grid, labels, *motions))
-        of.deformation.labels.copy_(labels)
+        assembly.deformation.control_points.copy_(control_points_from_groups(grid, labels, *motions))
+        assembly.deformation.labels.copy_(labels)
 
 
 GRID_OF_SCREWS = {"grid_shape": (4, 4, 8), "grid_spacing_mm": (8.0, 8.0, 10.0), "pitch_mm": 0.5}

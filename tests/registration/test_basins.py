@@ -2,51 +2,50 @@
 
 import pytest
 import torch
-from small_scene import GRID_OF_SCREWS, drilled_plate, image
+from small_scene import GRID_OF_SCREWS, drilled_plate, image, objective
 
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.registration import RegistrationConfig, Stage, Trainer, build_scene
+from torchkcreg.registration import Objective, RegistrationConfig, Stage, Trainer, build_scene
 from torchkcreg.registration.basins import places
-from torchkcreg.registration.objective import StageObjective
 
 CONFIG = RegistrationConfig(stages=(Stage(oversampling=1, margin_mm=None),), **GRID_OF_SCREWS)
 
 
-def objective_at(shift_mm: float) -> StageObjective:
+def objective_at(shift_mm: float) -> Objective:
     cloud = ImplantPointCloud.from_mesh(drilled_plate(), 0.5)
     pose = torch.eye(4, dtype=torch.float64)
-    data = image(build_scene(cloud, CONFIG), CONFIG)
+    data = image(build_scene(cloud, CONFIG))
     pose[2, 3] = shift_mm
     scene = build_scene(cloud, CONFIG, implant_to_world=pose)
-    return StageObjective(scene, data, CONFIG.stages[0], CONFIG)
+    return objective(scene, data, CONFIG.stages[0], CONFIG)
 
 
 def test_a_plate_one_hole_off_is_tried_one_hole_back() -> None:
-    objective = objective_at(16.0)
-    stayed, other, *_ = places(objective, objective.model.at_rest[0])
+    there = objective_at(16.0)
+    stayed, other, *_ = places(there, there.at_rest[0])
     assert (stayed == 0).all()
-    rest = objective.model.world_points(objective.model.at_rest)[0]
-    moved = objective.model.world_points(other[None])[0] - rest
+    rest, other_place = (there.moves.state(p).placements[0].nodes for p in (there.at_rest, other[None]))
+    moved = other_place - rest
     assert float(moved[0, :, 2].mean()) == pytest.approx(-16.0, abs=0.01)
     assert float(moved[0, :, :2].abs().max()) < 0.01
 
 
 def test_a_plate_in_its_place_is_tried_nowhere_else() -> None:
-    objective = objective_at(0.0)
-    assert len(places(objective, objective.model.at_rest[0])) == 1
+    there = objective_at(0.0)
+    assert len(places(there, there.at_rest[0])) == 1
 
 
 def test_the_start_is_tried_where_the_stage_left_it() -> None:
-    objective = objective_at(0.0)
+    there = objective_at(0.0)
     found = torch.zeros(6, dtype=torch.float64)
     found[3:] = 9.0
-    assert any((place == 0).all() for place in places(objective, found))
+    assert any((place == 0).all() for place in places(there, found))
 
 
 def test_a_registration_that_starts_one_hole_off_ends_in_its_place_and_tells_the_rival() -> None:
-    stages = (Stage(oversampling=1, margin_mm=None, slide=True), Stage(oversampling=1, margin_mm=None))
+    stages = (Stage(oversampling=1, margin_mm=None, after=("slide",)), Stage(oversampling=1, margin_mm=None))
     cloud = ImplantPointCloud.from_mesh(drilled_plate(), 0.5)
-    data = image(build_scene(cloud, CONFIG), CONFIG)
+    data = image(build_scene(cloud, CONFIG))
     pose = torch.eye(4, dtype=torch.float64)
     pose[2, 3] = 16.0
     trainer = Trainer(
@@ -60,4 +59,4 @@ def test_a_registration_that_starts_one_hole_off_ends_in_its_place_and_tells_the
 
 def test_only_a_stage_of_one_group_can_slide() -> None:
     with pytest.raises(ValueError, match="one group can slide"):
-        Stage(groups=2, slide=True)
+        Stage(groups=2, after=("slide",))

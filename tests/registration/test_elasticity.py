@@ -4,26 +4,36 @@ import math
 
 import pytest
 import torch
-from small_scene import bend, image, pose, scene
+from small_scene import bend, image, objective, pose, scene
 
-from torchkcreg.deformation import cluster_control_points, control_point_masses, default_grid, group_centers
+from torchkcreg.deformation import (
+    BendingPrior,
+    Elasticity,
+    FreeFormDeformation,
+    GroupMotion,
+    Level,
+    ModalMotion,
+    default_grid,
+)
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import RegistrationConfig, Scene, Stage
-from torchkcreg.registration.elasticity import Elasticity, ModalMotion
-from torchkcreg.registration.model import StageModel
-from torchkcreg.registration.motion import GroupMotion
-from torchkcreg.registration.objective import StageObjective
 from torchkcreg.simulation import locking_plate
 
 GRID = {"grid_shape": (4, 4, 8), "grid_spacing_mm": (8.0, 8.0, 8.0)}
 CONFIG = RegistrationConfig(stages=(Stage(groups=8, modes=14, oversampling=1),), **GRID)
 
 
-def modal(of, config=CONFIG) -> tuple[StageModel, ModalMotion]:
-    model = StageModel(of, image(of, config), config.schedule()[0], config)
-    assert isinstance(model.motion, ModalMotion)
-    return model, model.motion
+def modal(of: Scene) -> tuple[Elasticity, ModalMotion]:
+    (assembly,) = of.assemblies
+    motion = assembly.deformation.motion(assembly.implant, Level(groups=8, modes=14))
+    assert isinstance(motion, ModalMotion)
+    return motion.groups.elasticity, motion
+
+
+def in_grid(motion: ModalMotion, steps: torch.Tensor) -> torch.Tensor:
+    """Motions of the groups in the grid's axes."""
+    return motion.coefficients(steps) @ motion.groups.grid.frame[:3, :3]
 
 
 def test_the_softest_six_modes_are_rigid_and_the_others_stiffer_and_stiffer() -> None:
@@ -34,26 +44,27 @@ def test_the_softest_six_modes_are_rigid_and_the_others_stiffer_and_stiffer() ->
 
 
 def test_a_mode_moves_the_implant_by_a_root_mean_square_of_one_millimetre() -> None:
-    model, motion = modal(scene(CONFIG))
+    elasticity, motion = modal(scene(CONFIG))
     small = 1e-3 * torch.eye(motion.num_parameters, dtype=torch.float64)
-    displacements = model.elasticity.displacements(motion.steps(small))
+    displacements = elasticity.displacements(in_grid(motion, small))
     torch.testing.assert_close(displacements @ displacements.T, 1e-6 * torch.eye(14).double(), atol=2e-8, rtol=0)
 
 
 def test_the_energy_of_a_mode_is_half_its_stiffness() -> None:
-    model, motion = modal(scene(CONFIG))
+    elasticity, motion = modal(scene(CONFIG))
     for mode in (6, 9):
         step = torch.zeros(1, 14, dtype=torch.float64)
         step[0, mode] = 0.01
-        energy = model.elasticity.volume * model.elasticity.energy(motion.steps(step))
+        energy = elasticity.volume * elasticity.energy(in_grid(motion, step))
         assert float(energy.detach()) == pytest.approx(0.5 * float(motion.stiffnesses[mode]) * 1e-4, rel=0.02)
 
 
 def test_the_first_bend_is_as_stiff_as_a_free_beam_of_blended_sections() -> None:
     # Euler-Bernoulli: k = (4.730 / L)^4 I L for a mode of unit root mean square. Blended rigid groups are stiffer, and
     # the few nodes of the energy's integral have a little less second moment than the solid.
-    model, motion = modal(scene(CONFIG))
-    size = (model.implant.points.amax(0) - model.implant.points.amin(0)).double() + CONFIG.pitch_mm
+    here = scene(CONFIG)
+    _, motion = modal(here)
+    size = here.assemblies[0].implant.bounds.diff(dim=0)[0].double() + CONFIG.pitch_mm
     thickness, width, length = size.sort().values.tolist()
     beam = (4.730 / length) ** 4 * width * thickness**3 / 12 * length
     assert 0.6 * beam < float(motion.stiffnesses[6]) < 3 * beam
@@ -63,10 +74,10 @@ def test_a_stage_of_modes_starts_from_the_bend_so_far() -> None:
     every = CONFIG.model_copy(update={"stages": (CONFIG.stages[0].model_copy(update={"modes": 48}),)})
     here = scene(every, pose(1.0, 0.5))
     bend(here, math.radians(1.0))
-    bending = here.deformation.displacement(here.implant.points.double()).detach()
+    bending = here.assemblies[0].deformation.displacement(here.assemblies[0].implant.points.double()).detach()
     before = in_world(here)
-    objective = StageObjective(here, image(here, every), every.schedule()[0], every)
-    objective.accept(objective.model.at_rest[0])
+    modes = objective(here, image(here), every.schedule()[0], every)
+    modes.accept(modes.at_rest[0])
     error = (in_world(here) - before).norm(dim=-1)
     assert float(bending.norm(dim=-1).max()) > 0.1
     assert float(error.max()) < 0.02 * float(bending.norm(dim=-1).max())
@@ -75,29 +86,27 @@ def test_a_stage_of_modes_starts_from_the_bend_so_far() -> None:
 @pytest.mark.parametrize(("holes", "width"), [(4, 11.0), (6, 8.0), (7, 13.5), (9, 13.8)])
 def test_modes_of_short_and_narrow_plates_follow_a_bend(holes: int, width: float) -> None:
     mesh = locking_plate(length=15.0 * holes, width=width, thickness=3.2, num_holes=holes)
-    cloud = ImplantPointCloud.from_mesh(mesh, 1.0)
-    grid = default_grid(cloud.points)
-    masses = control_point_masses(grid, cloud.points, cloud.masses)
-    labels = cluster_control_points(grid, masses, 20)
-    rest = grid.positions().reshape(-1, 3)
-    carried, centers = masses.flatten(), group_centers(grid, labels)
-    groups = GroupMotion(rest, torch.zeros_like(rest), labels.flatten(), carried, centers)
-    elasticity = Elasticity(grid, labels, cloud.points, cloud.masses)
-    _, depth, height = cloud.points.double().unbind(-1)
+    cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
+    groups = GroupMotion(FreeFormDeformation(default_grid(cloud.points)), cloud, 20, BendingPrior())
+    _, depth, height = groups.elasticity.points.unbind(-1)
     curvature = 2.0 / height.max() ** 2
     displacement = torch.stack([0 * height, curvature / 2 * height**2, -curvature * height * depth], dim=-1)
-    motion = ModalMotion(groups, elasticity, 40, displacement @ grid.frame[:3, :3])
+    motion = ModalMotion(groups, 40, displacement)
     assert motion.misfit_mm < 0.02
     assert float(motion.start.abs().max()) < 5.0
-    motions = motion.steps(torch.zeros(1, motion.num_parameters).double())
-    middles = elasticity.of_filling().displacements(motions)  # groups without metal go along, they do not fly away
+    motions = in_grid(motion, motion.at_rest())
+    middles = groups.elasticity.of_filling().displacements(
+        motions
+    )  # groups without metal go along, they do not fly away
     assert float(middles.norm()) < 5.0
 
 
 def in_world(of: Scene) -> torch.Tensor:
     """Where the implant's nodes are."""
-    points = of.implant.points.double()
-    return transform_points(of.implant_to_world, points + of.deformation.displacement(points)).detach()
+    points = of.assemblies[0].implant.points.double()
+    return transform_points(
+        of.assemblies[0].implant_to_world, points + of.assemblies[0].deformation.displacement(points)
+    ).detach()
 
 
 def test_a_straight_implant_needs_no_load_and_a_bent_one_does() -> None:

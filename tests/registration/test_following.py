@@ -7,9 +7,10 @@ import torch
 from small_scene import SCREW, image, pose, scene
 from test_register import PLAIN
 
-from torchkcreg.registration import RegistrationData, Stage
-from torchkcreg.registration.following import FollowingBackground
-from torchkcreg.registration.objective import stage_objective
+from torchkcreg.registration import Stage, StageRun
+from torchkcreg.registration.stage_run import with_scatter_shapes
+from torchkcreg.scene import RegistrationData
+from torchkcreg.scene.following import FollowingBackground
 
 SHAPE = (2, 48, 40)
 
@@ -59,11 +60,14 @@ def test_no_primary_gives_no_nan() -> None:
 def test_the_gradient_of_an_objective_goes_through_it() -> None:
     config = PLAIN.model_copy(update={"material": "steel", "scatter": 0.05, "background_material": "cortical_bone"})
     true = scene(config, pose(0.4, 0.3), components=[SCREW])
-    modelled = image(true, config, background=torch.full((3, 160, 96), 20.0))
+    modelled = image(true, background=torch.full((3, 160, 96), 20.0))
     data = RegistrationData(modelled.geometry, modelled.line_integrals - math.log(1.05))
-    stage = Stage(bin=2, oversampling=1, background=True, contrast=True, estimate=("scatter", "hardness"))
-    objective = stage_objective(scene(config, components=[SCREW]), data, stage, config)
-    rest = objective.model.at_rest[0]
+    stage = Stage(bin=2, oversampling=1, similarity="gradient-difference", estimate=("scatter", "hardness"))
+    here = scene(config, components=[SCREW])
+    run = StageRun(here, with_scatter_shapes(here, data, config), stage, config)
+    run.with_background()
+    objective = run.objective
+    rest = objective.at_rest[0]
     _, gradient = objective.loss_and_gradient(rest)
     steps = 0.02 * torch.eye(len(rest), dtype=torch.float64)
     slopes = (objective.losses(rest + steps) - objective.losses(rest - steps)) / 0.04
@@ -72,11 +76,11 @@ def test_the_gradient_of_an_objective_goes_through_it() -> None:
 
 
 def test_estimates_go_on_beyond_the_detector() -> None:
-    modelled = image(scene(PLAIN), PLAIN)
+    modelled = image(scene(PLAIN))
     rows, cols = modelled.geometry.det_shape
     background = torch.arange(rows, dtype=torch.float32)[:, None].expand(3, rows, cols).contiguous()
     data = RegistrationData(modelled.geometry, modelled.line_integrals, background=background)
-    window = data.windowed(scene(PLAIN).nodes(4) + torch.tensor([0.0, 0.0, 40.0]), 4.0)
+    window = data.windowed(scene(PLAIN).assemblies[0].nodes(4) + torch.tensor([0.0, 0.0, 40.0]), 4.0)
     beyond = ~window.mask
     assert bool(beyond.any())
     assert bool((window.background[beyond] == rows - 1).all())

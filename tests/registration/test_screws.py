@@ -1,5 +1,6 @@
 """Screws that are found in an implant's holes, and their shapes that are estimated along."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,12 @@ import torch
 import trimesh
 from small_scene import GRID_OF_SCREWS, drilled_plate, image, pose
 
-from torchkcreg.implant import Component, ImplantPointCloud, find_holes
+from torchkcreg.implant import Component, ImplantPointCloud, Screw, find_holes
 from torchkcreg.registration import RegistrationConfig, Stage, build_scene, find_screws, register
-from torchkcreg.registration.found_screw import FoundScrew, ScrewShapes
-from torchkcreg.registration.model import StageModel
+from torchkcreg.scene import RegistrationData, Scene, screw_path
+from torchkcreg.scene.screw_shapes import ScrewShapes
 
-TRUE = FoundScrew((0.0, 1.5, 15.0), (0.0, -18.0, 15.0), 1.6, "steel")
+TRUE = Screw((0.0, 1.5, 15.0), (0.0, -18.0, 15.0), 1.6, "steel")
 CONFIG = RegistrationConfig(material="steel", stages=(Stage(oversampling=1),), **GRID_OF_SCREWS)
 
 
@@ -22,16 +23,21 @@ def mesh() -> trimesh.Trimesh:
     return drilled_plate()
 
 
-def scene_of(mesh: trimesh.Trimesh, motion: torch.Tensor | None = None, components: tuple[Component, ...] = ()):
+def scene_of(mesh: trimesh.Trimesh, motion: torch.Tensor | None = None, components: tuple[Screw, ...] = ()) -> Scene:
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     holes = find_holes(mesh)
-    return build_scene(cloud, CONFIG, implant_to_world=motion, components=components, holes=holes)
+    parts = [Component.of(screw, pitch=0.5) for screw in components]
+    return build_scene(cloud, CONFIG, implant_to_world=motion, components=parts, holes=holes)
+
+
+def found_in(mesh: trimesh.Trimesh, data: RegistrationData, bin: int = 1) -> list[Screw]:
+    scene = scene_of(mesh)
+    return find_screws(scene, scene.assemblies[0], data, bin=bin)
 
 
 def test_the_one_screw_of_three_holes_is_found_with_its_length_and_radius(mesh: trimesh.Trimesh) -> None:
-    screw = TRUE.component("true", 0.5)
-    data = image(scene_of(mesh, components=(screw,)), CONFIG)
-    (found,) = find_screws(scene_of(mesh), data, CONFIG, bin=1)
+    data = image(scene_of(mesh, components=(TRUE,)))
+    (found,) = found_in(mesh, data)
     assert np.allclose(found.start, TRUE.start, atol=0.3)
     assert np.allclose(found.end, TRUE.end, atol=1.0)
     assert found.radius == pytest.approx(TRUE.radius, abs=0.15)
@@ -40,8 +46,8 @@ def test_the_one_screw_of_three_holes_is_found_with_its_length_and_radius(mesh: 
 @pytest.mark.parametrize("metal", ["steel", "titanium"])
 def test_a_screw_of_either_metal_is_told_by_how_dark_it_is(mesh: trimesh.Trimesh, metal: str) -> None:
     screw = replace(TRUE, material=metal)
-    data = image(scene_of(mesh, components=(screw.component("true", 0.5),)), CONFIG)
-    (found,) = find_screws(scene_of(mesh), data, CONFIG, bin=1)
+    data = image(scene_of(mesh, components=(screw,)))
+    (found,) = found_in(mesh, data)
     assert found.material == metal
     assert np.allclose(found.end, TRUE.end, atol=1.0)
 
@@ -49,40 +55,41 @@ def test_a_screw_of_either_metal_is_told_by_how_dark_it_is(mesh: trimesh.Trimesh
 def test_a_tilted_screw_of_another_metal_does_not_pull_the_implant_along(mesh: trimesh.Trimesh) -> None:
     motion = pose(0.4, 0.3)
     tilted = replace(TRUE, material="titanium").moved(torch.tensor([0.0, 0.0, 0.1]), torch.zeros(3))
-    data = image(scene_of(mesh, motion, components=(tilted.component("true", 0.5),)), CONFIG)
-    fit = {"oversampling": 1, "tilts": True, "tolerance": 1e-4, "iterations": 40}
-    stages = (Stage(bin=2, screws="find", **fit), Stage(bin=2, screws="find", **fit), Stage(screws="fit", **fit))
+    data = image(scene_of(mesh, motion, components=(tilted,)))
+    fit = {"oversampling": 1, "estimate": ("screws", "tilts"), "tolerance": 1e-4, "iterations": 40}
+    stages = (*(2 * [Stage(bin=2, before=("find_screws",), **fit)]), Stage(**fit))
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
-    (found,) = result.screws
-    assert found["material"] == "titanium"
-    assert np.allclose(found["end"], tilted.end, atol=0.4)
+    (found,) = result.screws_found
+    assert found.material == "titanium"
+    assert np.allclose(found.end, tilted.end, atol=0.4)
     points = cloud.points.double()
     truth = points @ motion[:3, :3].T + motion[:3, 3]
     assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.05
 
 
-def test_a_screw_moves_to_the_other_part_of_a_combination_hole_and_keeps_its_tip(mesh: trimesh.Trimesh) -> None:
-    moved = TRUE.shifted_to((0.0, 1.5, 17.0))
+def test_a_screw_moves_to_the_other_part_of_a_combination_hole_as_a_whole() -> None:
+    moved = TRUE.moved(torch.zeros(3), torch.tensor([0.0, 0.0, 2.0]))
     assert moved.end == pytest.approx((0.0, -18.0, 17.0)) and moved.length == pytest.approx(TRUE.length)
     assert TRUE.same_side(moved) and not TRUE.same_side(replace(TRUE, end=(0.0, 20.0, 15.0)))
 
 
 def test_no_screw_is_found_where_there_is_none(mesh: trimesh.Trimesh) -> None:
-    data = image(scene_of(mesh), CONFIG)
+    data = image(scene_of(mesh))
     noise = torch.randn(data.line_integrals.shape, generator=torch.Generator().manual_seed(0))
     noisy = type(data)(data.geometry, data.line_integrals + 0.02 * noise)
-    assert find_screws(scene_of(mesh), noisy, CONFIG, bin=2) == []
+    assert found_in(mesh, noisy, bin=2) == []
 
 
 def test_a_registration_that_is_told_of_no_screw_finds_it_and_its_shape(mesh: trimesh.Trimesh) -> None:
     motion = pose(0.4, 0.3)
-    data = image(scene_of(mesh, motion, components=(TRUE.component("true", 0.5),)), CONFIG)
-    stages = (Stage(bin=2, oversampling=1, screws="find"), Stage(oversampling=1, screws="fit", tolerance=1e-4))
+    data = image(scene_of(mesh, motion, components=(TRUE,)))
+    fit = {"oversampling": 1, "estimate": ("screws",)}
+    stages = (Stage(bin=2, before=("find_screws",), **fit), Stage(tolerance=1e-4, **fit))
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
-    (found,) = result.screws
-    assert np.allclose(found["end"], TRUE.end, atol=0.25)
+    (found,) = result.screws_found
+    assert np.allclose(found.end, TRUE.end, atol=0.25)
     points = cloud.points.double()
     truth = points @ motion[:3, :3].T + motion[:3, 3]
     assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.05
@@ -90,42 +97,44 @@ def test_a_registration_that_is_told_of_no_screw_finds_it_and_its_shape(mesh: tr
 
 def test_screws_found_at_the_start_keep_the_first_stage_from_sliding(mesh: trimesh.Trimesh) -> None:
     start = pose(1.0, 0.5)
-    data = image(scene_of(mesh, start, components=(TRUE.component("true", 0.5),)), CONFIG)
-    stages = (Stage(bin=2, oversampling=1, slide=True, screws="find", iterations=30),)
+    data = image(scene_of(mesh, start, components=(TRUE,)))
+    steps = {"before": ("find_screws",), "after": ("slide",)}
+    stages = (Stage(bin=2, oversampling=1, estimate=("screws",), iterations=30, **steps),)
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
-    assert len(result.screws) == 1
+    assert len(result.screws_found) == 1
     points = cloud.points.double()
     truth = points @ start[:3, :3].T + start[:3, 3]
     assert float((result.warp(points) - truth).norm(dim=-1).max()) < 0.5
 
 
 def test_screws_are_not_looked_for_where_that_is_not_wanted(mesh: trimesh.Trimesh) -> None:
-    data = image(scene_of(mesh, components=(TRUE.component("true", 0.5),)), CONFIG)
-    stages = (Stage(bin=2, oversampling=1, iterations=1, screws="find"),)
+    data = image(scene_of(mesh, components=(TRUE,)))
+    stages = (Stage(bin=2, oversampling=1, iterations=1, before=("find_screws",), estimate=("screws",)),)
     config = CONFIG.model_copy(update={"stages": stages, "find_screws": False})
     result = register(ImplantPointCloud.from_mesh(mesh, 0.5), data, config, holes=find_holes(mesh))
-    assert result.screws == []
+    assert result.screws_found == []
 
 
 def test_shapes_are_the_slopes_of_the_images(mesh: trimesh.Trimesh) -> None:
-    model = StageModel(scene_of(mesh), image(scene_of(mesh), CONFIG), CONFIG.stages[0], CONFIG)
-    shapes = ScrewShapes([TRUE], model.screw_path)
-    longer = shapes(torch.tensor([[0.4, 0.0]], dtype=torch.float64))["steel"][0]
+    scene = scene_of(mesh)
+    path = functools.partial(screw_path, scene.assemblies[0], scene.view(image(scene), oversampling=1, margin_mm=6.0))
+    shapes = ScrewShapes([TRUE], path)
+    longer = shapes.added(torch.tensor([[0.4, 0.0]], dtype=torch.float64))["steel"][0]
     (stepped,) = shapes.stepped(torch.tensor([0.4, 0.0], dtype=torch.float64))
     assert stepped.length == pytest.approx(TRUE.length + 0.4)
-    change = model.screw_path(stepped) - model.screw_path(TRUE)
+    change = path(stepped) - path(TRUE)
     assert float(longer.sum()) == pytest.approx(float(change.sum()), rel=0.03)
-    thicker = shapes(torch.tensor([[0.0, 0.5]], dtype=torch.float64))["steel"][0]
+    thicker = shapes.added(torch.tensor([[0.0, 0.5]], dtype=torch.float64))["steel"][0]
     (stepped,) = shapes.stepped(torch.tensor([0.0, 0.5], dtype=torch.float64))
     assert stepped.radius == pytest.approx(TRUE.radius + 0.1)
-    change = model.screw_path(stepped) - model.screw_path(TRUE)
+    change = path(stepped) - path(TRUE)
     assert float(thicker.sum()) == pytest.approx(float(change.sum()), rel=0.06)
 
 
 def test_screws_side_by_side_overlap_and_others_do_not() -> None:
-    beside = FoundScrew((0.0, 1.5, 18.0), (0.0, -18.0, 18.0), 1.6, "steel")
-    apart = FoundScrew((0.0, 1.5, 19.0), (0.0, -18.0, 19.0), 1.6, "steel")
+    beside = Screw((0.0, 1.5, 18.0), (0.0, -18.0, 18.0), 1.6, "steel")
+    apart = Screw((0.0, 1.5, 19.0), (0.0, -18.0, 19.0), 1.6, "steel")
     assert TRUE.overlaps(TRUE.with_length(5.0)) and TRUE.overlaps(beside) and not TRUE.overlaps(apart)
 
 
@@ -133,8 +142,9 @@ def test_screws_side_by_side_overlap_and_others_do_not() -> None:
 def test_the_metal_is_the_one_with_which_a_stage_ends_best(mesh: trimesh.Trimesh, metal: str) -> None:
     motion = pose(0.3, 0.2)
     screw = replace(TRUE, material=metal)
-    data = image(scene_of(mesh, motion, components=(screw.component("true", 0.5),)), CONFIG)
-    stages = (Stage(bin=2, oversampling=1, screws="choose", contrast=True, tilts=True, iterations=30),)
+    data = image(scene_of(mesh, motion, components=(screw,)))
+    options = {"similarity": "gradient-difference", "estimate": ("screws", "tilts"), "iterations": 30}
+    stages = (Stage(bin=2, oversampling=1, before=("choose_screws",), **options),)
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
-    assert [found["material"] for found in result.screws] == [metal]
+    assert [found.material for found in result.screws_found] == [metal]

@@ -8,8 +8,8 @@ from small_scene import RIGID, SCREW, image, pose, scene
 
 from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, Trainer
 from torchkcreg.registration.basins import Rival
-from torchkcreg.registration.nuisance import Nuisance
 from torchkcreg.registration.verdict import Diagnostics, judge
+from torchkcreg.scene.physics import PhysicsParameters
 
 CONFIG = RegistrationConfig(stages=RIGID)
 GOOD = Diagnostics(gc=[0.95, 0.9], misfit=0.01, node_std_mm=0.02, seen=[1.0, 0.8], strain=1e-4)
@@ -50,9 +50,7 @@ def registered(data: RegistrationData, config: RegistrationConfig = CONFIG, **st
 
 
 def test_the_right_images_are_ok() -> None:
-    result = registered(
-        image(scene(CONFIG, components=[SCREW]), CONFIG), components=[SCREW], implant_to_world=pose(1.0, 1.0)
-    )
+    result = registered(image(scene(CONFIG, components=[SCREW])), components=[SCREW], implant_to_world=pose(1.0, 1.0))
     assert result.status == "ok", result.warnings
     assert result.warnings == []
     assert result.diagnostics["node_std_mm"] < 0.1
@@ -66,7 +64,7 @@ def test_what_explains_little_and_is_held_by_little_fails() -> None:
 
 @pytest.mark.parametrize("what", ["blank", "flipped", "noise"])
 def test_images_of_something_else_fail(what: str) -> None:
-    data = image(scene(CONFIG), CONFIG)
+    data = image(scene(CONFIG))
     lines = {
         "blank": torch.zeros_like(data.line_integrals),
         "flipped": data.line_integrals.flip(-1, -2),
@@ -78,7 +76,7 @@ def test_images_of_something_else_fail(what: str) -> None:
 
 
 def test_an_implant_that_leaves_the_images_is_told() -> None:
-    data = image(scene(CONFIG), CONFIG)
+    data = image(scene(CONFIG))
     mask = torch.zeros_like(data.mask)
     mask[:, :70] = True
     result = registered(replace(data, mask=mask))
@@ -89,22 +87,22 @@ def test_an_implant_that_leaves_the_images_is_told() -> None:
 def test_a_parameter_that_ends_at_its_bound_is_named() -> None:
     physical = RegistrationConfig(material="steel", stages=(Stage(estimate=("scatter", "blur")),))
     here = scene(physical)
-    assert Nuisance(here, physical, ("scatter", "blur"), 1.0).at_bounds(0.01) == []
+    assert PhysicsParameters(here.intensity, ("scatter", "blur"), 1.0, 1.0).at_bounds(0.01) == []
     with torch.no_grad():
         here.intensity.get_parameter("scatter").fill_(0.9)
-    assert Nuisance(here, physical, ("scatter", "blur"), 1.0).at_bounds(0.01) == ["scatter"]
+    assert PhysicsParameters(here.intensity, ("scatter", "blur"), 1.0, 1.0).at_bounds(0.01) == ["scatter"]
 
 
 def test_a_bound_where_a_parameter_is_likely_to_be_says_nothing() -> None:
     """Nothing may be scattered from what a limb removes, but scanners without any scatter there are hardly."""
     physical = RegistrationConfig(material="steel", stages=(Stage(estimate=("scatter", "removed")),))
     here = scene(physical)
-    nuisance = Nuisance(here, physical, ("scatter", "removed"), 1.0)
+    nuisance = PhysicsParameters(here.intensity, ("scatter", "removed"), 1.0, 1.0)
     assert float(here.intensity.get_parameter("scatter_removed")) == 0.0
     assert nuisance.at_bounds(0.01) == []
     with torch.no_grad():
         here.intensity.get_parameter("scatter").fill_(0.0)
-    assert Nuisance(here, physical, ("scatter", "removed"), 1.0).at_bounds(0.01) == ["scatter"]
+    assert PhysicsParameters(here.intensity, ("scatter", "removed"), 1.0, 1.0).at_bounds(0.01) == ["scatter"]
 
 
 def test_screws_that_were_found_ask_for_more() -> None:

@@ -13,7 +13,7 @@ from torchkcreg.deformation.grid import ControlPointGrid
 _LEAST_LOAD = 1e-3
 
 
-def control_point_masses(grid: ControlPointGrid, points: Tensor, masses: Tensor) -> Tensor:
+def control_point_volumes(grid: ControlPointGrid, points: Tensor, volumes: Tensor) -> Tensor:
     """Implant volume that each control point carries, sum_n m_n B_c(x_n), mm^3, shape (nx, ny, nz), float64.
 
     They add up to the implant's volume; what a CP beyond the grid would carry counts to the nearest real one.
@@ -21,21 +21,21 @@ def control_point_masses(grid: ControlPointGrid, points: Tensor, masses: Tensor)
     Args:
         grid: control points.
         points: nodes in the implant's frame, mm, shape (N, 3).
-        masses: of the nodes, mm^3, shape (N,).
+        volumes: of the nodes, mm^3, shape (N,).
 
     Raises:
         ValueError: if shapes do not fit.
 
     Example:
         >>> grid = ControlPointGrid((4, 4, 4), (10.0, 10.0, 10.0), torch.eye(4))
-        >>> carried = control_point_masses(grid, 15 + torch.zeros(2, 3), torch.tensor([1.0, 2.0]))
+        >>> carried = control_point_volumes(grid, 15 + torch.zeros(2, 3), torch.tensor([1.0, 2.0]))
         >>> round(float(carried.sum()), 6)
         3.0
     """
-    if masses.shape != points.shape[:1]:
-        raise ValueError(f"masses must have shape ({len(points)},), got {tuple(masses.shape)}")
+    if volumes.shape != points.shape[:1]:
+        raise ValueError(f"volumes must have shape ({len(points)},), got {tuple(volumes.shape)}")
     basis = SplineBasis(grid, points, torch.float64)
-    carried = basis.scatter(masses.double()[:, None]).flatten()
+    carried = basis.scatter(volumes.double()[:, None]).flatten()
     nearest = basis.control_points()[1].flatten()
     return carried.new_zeros(grid.num_control_points).index_add(0, nearest, carried).reshape(grid.shape)
 
@@ -50,7 +50,7 @@ def cluster_control_points(grid: ControlPointGrid, weights: Tensor, num_groups: 
 
     Args:
         grid: control points.
-        weights: implant volume that each CP carries (`control_point_masses`), not negative, shape (nx, ny, nz).
+        weights: implant volume that each CP carries (`control_point_volumes`), not negative, shape (nx, ny, nz).
         num_groups: G, at least 1.
 
     Raises:
@@ -64,7 +64,7 @@ def cluster_control_points(grid: ControlPointGrid, weights: Tensor, num_groups: 
     if weights.shape != grid.shape or not (weights >= 0).all() or not weights.sum() > 0:
         raise ValueError(f"weights must be of shape {grid.shape}, not negative, not all 0, got {tuple(weights.shape)}")
     weights = weights.detach().double().flatten()
-    loaded = (weights >= _LEAST_LOAD * weights.max()).nonzero().squeeze(-1)
+    loaded = carrying(weights).nonzero().squeeze(-1)
     if not 1 <= num_groups <= len(loaded):
         raise ValueError(f"num_groups must be 1 to {len(loaded)}, the CPs that carry implant, got {num_groups}")
     all_positions = grid.positions().to(weights.device).reshape(-1, 3)
@@ -80,6 +80,11 @@ def cluster_control_points(grid: ControlPointGrid, weights: Tensor, num_groups: 
         for part in (widest, new):
             extents[part] = _principal_extent(positions[groups == part], load[groups == part])
     return groups[torch.cdist(all_positions, positions).argmin(-1)].reshape(grid.shape)
+
+
+def carrying(weights: Tensor) -> Tensor:
+    """True for control points with implant near them, in the shape of their weights: as many as there can be groups."""
+    return weights >= _LEAST_LOAD * weights.max()
 
 
 def _principal_extent(positions: Tensor, load: Tensor) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,6 +59,10 @@ class ControlPointGrid:
         """CPs in the grid's frame, mm, shape (nx, ny, nz, 3), float64."""
         axes = [torch.arange(n, dtype=torch.float64) * s for n, s in zip(self.shape, self.spacing, strict=True)]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).to(self.frame.device)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Shape, spacing and frame, for files."""
+        return {"shape": list(self.shape), "spacing_mm": list(self.spacing), "grid_to_implant": self.frame}
 
     def to_grid(self, points: Tensor) -> Tensor:
         """Points (..., 3) of the implant's frame in the grid's frame, mm, in the points' dtype."""

@@ -102,27 +102,24 @@ def _cell_moments(grid: ControlPointGrid, labels: Tensor, basis: SplineBasis, ce
     return torch.cat([member, (member[..., None] * arms).flatten(-2)], dim=-1).to(basis.eta.dtype)
 
 
-def displacement_from_groups(shares: Tensor, moments: Tensor, rotations: Tensor, translations: Tensor) -> Tensor:
-    """Displacements (..., N, 3), mm, of nodes whose groups of control points move rigidly, in the grid's axes.
+def moment_features(grid: ControlPointGrid, labels: Tensor, points: Tensor) -> Tensor:
+    """Moments (N, 4 G), float64, of points (N, 3): W_g, then the three of M_g, one group after the other.
 
-    u = sum_g W_g t_g + (R_g - I) M_g, as a matrix product for all candidates at once. The result of several candidates
-    is a strided view, in which the candidates of one node are neighbours.
+    Displacements in the grid's axes are ``moment_features @ motion_coefficients``, for all candidates at once.
+    """
+    shares, moments = group_moments(grid, labels, points.double())
+    return torch.cat([shares[..., None], moments], dim=-1).flatten(1)
+
+
+def motion_coefficients(rotations: Tensor, translations: Tensor) -> Tensor:
+    """Motions (..., 4 G, 3) of groups as `moment_features` multiply them: t_g, then R_g - I, in the grid's axes.
 
     Args:
-        shares: W of `group_moments`, (N, G).
-        moments: M of `group_moments`, (N, G, 3), mm.
         rotations: of the groups about their centres, (..., G, 3, 3).
         translations: of the groups' centres, mm, (..., G, 3).
     """
-    groups = shares.shape[-1]
-    _check_motions(rotations, translations, groups)
-    candidates = torch.broadcast_shapes(rotations.shape[:-3], translations.shape[:-2])
-    turns = (rotations - torch.eye(3).to(rotations)).mT.expand(*candidates, groups, 3, 3).reshape(-1, 3 * groups, 3)
-    shifts = translations.expand(*candidates, groups, 3).reshape(-1, groups, 3)
-    # All candidates side by side in one wide product: one narrow product each takes five times as long.
-    shifts, turns = (steps.movedim(0, 1).flatten(1).to(shares) for steps in (shifts, turns))
-    u = (shares @ shifts).addmm_(moments.flatten(-2), turns)
-    return u.unflatten(-1, (-1, 3)).movedim(1, 0).reshape(*candidates, *u.shape[:-1], 3)
+    turns = (rotations - torch.eye(3).to(rotations)).mT
+    return torch.cat([translations[..., None, :], turns], dim=-2).flatten(-3, -2)
 
 
 def control_points_from_groups(
@@ -145,32 +142,6 @@ def control_points_from_groups(
     turns = (rotations - torch.eye(3).to(rotations))[..., group, :, :]
     phi = (turns @ arms[:, :, None]).squeeze(-1) + translations[..., group, :]
     return phi.unflatten(-2, grid.shape)
-
-
-def split_motions(
-    grid: ControlPointGrid, parent_labels: Tensor, child_labels: Tensor, rotations: Tensor, translations: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Rotations (..., H, 3, 3) and translations (..., H, 3) of finer groups that move as their parents do.
-
-    Args:
-        grid: control points.
-        parent_labels: coarse groups 0 to G - 1, (nx, ny, nz).
-        child_labels: groups 0 to H - 1, each part of one coarse group, (nx, ny, nz).
-        rotations: of the coarse groups, (..., G, 3, 3).
-        translations: of the coarse groups' centres, mm, (..., G, 3).
-
-    Raises:
-        ValueError: if a fine group is not part of one coarse group.
-    """
-    parents, children = group_centers(grid, parent_labels), group_centers(grid, child_labels)
-    _check_motions(rotations, translations, len(parents))
-    pairs = torch.unique(torch.stack([child_labels.flatten(), parent_labels.flatten()]), dim=1)
-    if pairs.shape[1] != len(children):
-        raise ValueError(f"child_labels must refine parent_labels, got {pairs.shape[1]} overlaps of {len(children)}")
-    parent = pairs[1]
-    arms = (children - parents[parent]).to(translations)
-    turned = rotations[..., parent, :, :]
-    return turned, (turned @ arms[:, :, None]).squeeze(-1) - arms + translations[..., parent, :]
 
 
 def _check_labels(grid: ControlPointGrid, labels: Tensor) -> None:

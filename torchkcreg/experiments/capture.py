@@ -182,7 +182,7 @@ def rigid_stages(config: RegistrationConfig) -> RegistrationConfig:
     Raises:
         ValueError: If there is none.
     """
-    stages: tuple[Stage, ...] = tuple(stage for stage in config.schedule() if stage.groups == 1)
+    stages: tuple[Stage, ...] = tuple(stage for stage in config.schedule() if stage.level.is_rigid)
     if not stages:
         raise ValueError("the configuration has no rigid stage (groups: 1)")
     return config.model_copy(update={"stages": stages})
@@ -193,10 +193,7 @@ def registration_inputs(
 ) -> tuple[RegistrationData, ImplantPointCloud, list[Component]]:
     """Projections, implant and screws of a simulated case as a registration takes them."""
     lines, mask = line_integrals_from_intensity(case.intensity, case.open_beam, saturation=case.saturation)
-    screws = [
-        Component.screw(f"screw{i}", s["from"], s["to"], s["radius"], material=s["material"], pitch=pitch_mm)
-        for i, s in enumerate(case.screws)
-    ]
+    screws = [Component.of(screw, pitch=pitch_mm) for screw in case.screws]
     return RegistrationData(case.geometry, lines, mask), ImplantPointCloud.from_mesh(case.implant, pitch_mm), screws
 
 

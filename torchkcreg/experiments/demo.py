@@ -11,7 +11,6 @@ from torch import Tensor
 from torchkcreg.evaluation import PointMetrics, evaluate_points, point_errors
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import (
-    ComponentSpec,
     write_components,
     write_geometry,
     write_json,
@@ -92,23 +91,14 @@ def _write_case(folder: Path, case: SimulatedCase) -> RegistrationFiles:
         components=folder / "screws.json",
         spectrum=folder / "spectrum.csv",
     )
-    screws = [
-        ComponentSpec(_triple(s["from"]), _triple(s["to"]), s["radius"], s["material"], f"screw{i}")
-        for i, s in enumerate(case.screws)
-    ]
     write_mesh(files.implant, case.implant)
     write_geometry(files.geometry, case.geometry)
     write_projections(files.projections, intensity=case.intensity, open_beam=case.open_beam)
-    write_components(folder / "screws.json", screws)
+    write_components(folder / "screws.json", case.screws)
     write_spectrum(folder / "spectrum.csv", tungsten_spectrum(ASSUMED_KVP))
     write_points(folder / "beads_before.csv", case.beads_before)
     write_points(folder / "beads_after.csv", case.beads_after)
     return files
-
-
-def _triple(values: list[float]) -> tuple[float, float, float]:
-    x, y, z = values
-    return x, y, z
 
 
 def _evaluate(case: SimulatedCase, result: RegistrationResult) -> tuple[dict[str, PointMetrics], str]:

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import torch
 
+from torchkcreg.deformation import FreeFormDeformation
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.implant import volume
 from torchkcreg.io import RunFolder, geometry_from_dict, read_json, read_mesh, read_projections, versions
 from torchkcreg.projector.extension import PACKAGE
 from torchkcreg.projector.ops import choose_backend, load_operators
+from torchkcreg.registration import RegisteredImplant
 
 _MESHES = (".stl", ".obj", ".ply", ".off", ".3mf")
 _IMAGES = (".npz", ".npy", ".mha", ".mhd", ".nrrd", ".nii", ".gz", ".tif", ".tiff")
@@ -109,11 +111,9 @@ def _run(path: Path) -> str:
     run = RunFolder(path)
     result = run.read_result()
     metrics = read_json(path / "metrics.json", "metrics") if (path / "metrics.json").is_file() else {}
-    shape = " x ".join(str(n) for n in result.deformation.grid.shape)
-    groups = int(result.deformation.labels.max()) + 1
-    size = f"{shape} control points in {groups} group{'s' * (groups > 1)}"
+    sizes = "; ".join(_size(implant) for implant in result.implants)
     lines = [
-        f"run, {result.status}, {size}, {len(result.history)} iterations",
+        f"run, {result.status}, {sizes}, {len(result.history)} iterations",
         "  gradient correlation of each view: " + " ".join(f"{gc:.3f}" for gc in result.gc.tolist()),
     ]
     if isinstance(metrics.get("node_std_mm"), float):
@@ -127,3 +127,12 @@ def _run(path: Path) -> str:
         lines.append(f"  took {metrics['seconds']:.0f} s")
     lines += [f"  {name}: {value:.3g}" for name, value in result.intensity.items()]
     return "\n".join([*lines, *(f"  warning: {text}" for text in result.warnings)])
+
+
+def _size(implant: RegisteredImplant) -> str:
+    deformation = implant.deformation
+    if not isinstance(deformation, FreeFormDeformation):
+        return f"{implant.name}: {deformation.model} deformation"
+    shape = " x ".join(str(n) for n in deformation.grid.shape)
+    groups = deformation.num_groups
+    return f"{implant.name}: {shape} control points in {groups} group{'s' * (groups > 1)}"

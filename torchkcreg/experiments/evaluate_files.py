@@ -135,7 +135,7 @@ def _draw(
 
 def _displacement(result: RegistrationResult, mesh: trimesh.Trimesh) -> Figure:
     cloud = ImplantPointCloud.from_mesh(mesh, 2 * result.config.pitch_mm, dtype=torch.float64)
-    bent = displacement_map(cloud.points, result.warp(cloud.points), weights=cloud.masses)
+    bent = displacement_map(cloud.points, result.warp(cloud.points), weights=cloud.volumes)
     return displacement_figure(
         bent.undeformed,
         bent.vectors,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,14 +11,9 @@ from torch import Tensor
 
 from torchkcreg.evaluation import displacement_map
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.registration import (
-    RegistrationData,
-    RegistrationResult,
-    Scene,
-    Stage,
-    StageModel,
-    stage_objective,
-)
+from torchkcreg.registration import RegisteredImplant, RegistrationResult, Stage, StageRun, similarities
+from torchkcreg.scene import Assembly, RegistrationData, Scene
+from torchkcreg.similarity import GradientCorrelation
 from torchkcreg.visualization import displacement_figure, history_figure, overlay_figure
 
 if TYPE_CHECKING:
@@ -29,20 +25,26 @@ _DRAWN_SHARE = 0.05  # of the implant's length: as far as the largest displaceme
 
 
 def draw_registration(
-    result: RegistrationResult, scene: Scene, data: RegistrationData, initial: Tensor
+    result: RegistrationResult, data: RegistrationData, starts: Sequence[Tensor]
 ) -> dict[str, Figure]:
     """Figures of a registration by file name: "overlay.png", "displacement.png", "history.png".
 
+    The displacements of a second implant, and of more, are in pictures that begin with its name.
+
     Args:
-        result: The registration.
-        scene: Its scene in the state it ended in.
+        result: The registration, with its scene.
         data: What was registered; of more than six views, six are drawn.
-        initial: Pose (4, 4) at which the registration started.
+        starts: Pose (4, 4) of each implant at which the registration started.
+
+    Raises:
+        ValueError: If the result has no scene.
     """
-    figures = {
-        "overlay.png": _overlay(result, scene, data, initial),
-        "displacement.png": _displacement(result, scene),
-    }
+    if result.scene is None:
+        raise ValueError("the result has no scene to draw: it was read from files")
+    figures = {"overlay.png": _overlay(result, result.scene, data, starts)}
+    for number, assembly in enumerate(result.scene):
+        prefix = f"{assembly.name}_" if number else ""
+        figures[f"{prefix}displacement.png"] = _displacement(result.implants[number], assembly)
     if result.history:
         labels = [_stage_label(stage) for stage in result.config.schedule()]
         figures["history.png"] = history_figure(result.history, stage_labels=labels)
@@ -55,23 +57,24 @@ def _stage_label(stage: Stage) -> str:
     return f"{stage.groups} group{'s' * (stage.groups > 1)}"
 
 
-def start_scene(scene: Scene, initial: Tensor) -> Scene:
-    """A copy of a scene with the undeformed implant at its start pose."""
+def start_scene(scene: Scene, starts: Sequence[Tensor]) -> Scene:
+    """A copy of a scene with the undeformed implants at their start poses."""
     start = copy.deepcopy(scene)
     with torch.no_grad():
-        start.deformation.control_points.zero_()
-        start.implant_to_world.copy_(initial)
+        for assembly, pose in zip(start, starts, strict=True):
+            assembly.deformation.reset()
+            assembly.implant_to_world.copy_(pose)
     return start
 
 
-def _overlay(result: RegistrationResult, scene: Scene, data: RegistrationData, initial: Tensor) -> Figure:
+def _overlay(result: RegistrationResult, scene: Scene, data: RegistrationData, starts: Sequence[Tensor]) -> Figure:
     views = torch.linspace(0, data.num_views - 1, min(data.num_views, MOST_VIEWS)).round().long().tolist()
     shown = data.select(views)
-    start = start_scene(scene, initial)
+    start = start_scene(scene, starts)
     return overlay_figure(
         shown.line_integrals,
-        _drr(scene, shown, result),
-        before=_drr(start, shown, result),
+        _drr(scene, shown),
+        before=_drr(start, shown),
         view_labels=_labels(shown.geometry, views),
         gc_before=_similarity(start, shown, result),
         gc_after=_similarity(scene, shown, result),
@@ -80,20 +83,17 @@ def _overlay(result: RegistrationResult, scene: Scene, data: RegistrationData, i
 
 
 @torch.no_grad()
-def _drr(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Tensor:
-    """Path lengths (V, rows, cols) of implant and components on the whole detector, mm."""
-    groups = result.config.schedule()[-1].groups  # fewer could not hold the result's bending
-    stage = Stage(groups=groups, bin=1, pitch_factor=2, oversampling=1, margin_mm=None)
-    model = StageModel(scene, data, stage, result.config)
-    return model.path_lengths(model.at_rest)[0].sum(dim=0)
+def _drr(scene: Scene, data: RegistrationData) -> Tensor:
+    """Path lengths (V, rows, cols) of implants and components on the whole detector, mm."""
+    view = scene.view(data.geometry, oversampling=1, pitch_factor=2)
+    return scene.path_lengths(view)[0].sum(dim=0)
 
 
-@torch.no_grad()
 def _similarity(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Tensor:
     """GC (V,) as the result has it, so that start and result are measured alike."""
-    stage = result.config.schedule()[-1].model_copy(update={"robust": False, "contrast": False})
-    objective = stage_objective(scene, data, stage, result.config)
-    return objective.similarities(objective.model.at_rest)[0]
+    run = StageRun(scene, data, result.config.schedule()[-1], result.config)
+    run.with_background()
+    return similarities(run, GradientCorrelation)
 
 
 def _labels(geometry: ConeBeamGeometry, views: list[int]) -> list[str]:
@@ -104,9 +104,9 @@ def _labels(geometry: ConeBeamGeometry, views: list[int]) -> list[str]:
     return names if geometry.sources is None else [f"{n}, {s}" for n, s in zip(names, geometry.sources, strict=True)]
 
 
-def _displacement(result: RegistrationResult, scene: Scene) -> Figure:
-    cloud = scene.implant.coarsened(2)
-    bent = displacement_map(cloud.points, result.warp(cloud.points), weights=cloud.masses)
+def _displacement(implant: RegisteredImplant, assembly: Assembly) -> Figure:
+    cloud = assembly.implant.coarsened(2)
+    bent = displacement_map(cloud.points, implant.warp(cloud.points), weights=cloud.volumes)
     length = float((cloud.bounds[1] - cloud.bounds[0]).max())
     largest = max(float(bent.magnitudes.max()), 1e-9)
     drawn = next((e for e in _EXAGGERATIONS if e * largest <= _DRAWN_SHARE * length), 1.0)
@@ -114,6 +114,6 @@ def _displacement(result: RegistrationResult, scene: Scene) -> Figure:
         bent.undeformed,
         bent.vectors,
         exaggeration=drawn,
-        title="bending of the implant, its distal end at rest",
+        title=f"bending of the {assembly.name}, its distal end at rest",
         label="displacement against the distal end (mm)",
     )

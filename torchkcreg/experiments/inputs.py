@@ -92,13 +92,11 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
     with _noted() as notes:
         data = _read_data(files, config)
         spectrum = read_spectrum(files.spectrum) if files.spectrum else None
-        specs = read_components(files.components) if files.components else []
+        screws = read_components(files.components) if files.components else []
         pose = read_init(files.init) if files.init else None
         mesh = read_mesh(files.implant)
         _check_size(files.implant, mesh, config.pitch_mm)
-        components = [
-            Component.screw(c.name, c.start, c.end, c.radius, material=c.material, pitch=config.pitch_mm) for c in specs
-        ]
+        components = [Component.of(screw, pitch=config.pitch_mm) for screw in screws]
         implant = ImplantPointCloud.from_mesh(mesh, config.pitch_mm)
         holes = find_holes(mesh)
         placed = implant.points if pose is None else transform_points(pose, implant.points.double())

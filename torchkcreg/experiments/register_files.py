@@ -16,17 +16,21 @@ from torchkcreg.geometry import transform_points
 from torchkcreg.io import RunFolder, read_config
 from torchkcreg.registration import (
     Callback,
+    Progress,
     ProgressBar,
     RegistrationConfig,
     RegistrationResult,
     Scene,
+    Stage,
     Trainer,
+    TrainerState,
     build_scene,
 )
 
 from .figures import draw_registration
 from .inputs import RegistrationFiles, RegistrationInputs, read_inputs
 
+_CHECKPOINT_SECONDS = 5.0
 RECORD_KEYS = {"files", "options", "schedule"}
 
 
@@ -135,22 +139,30 @@ def write_run(
 ) -> None:
     """Nothing; writes metrics, figures and the result of a finished registration to its run folder."""
     initial = torch.eye(4, dtype=torch.float64) if inputs.implant_to_world is None else inputs.implant_to_world
-    run.write_metrics({**_metrics(result, trainer.scene, initial, seconds), **(more_metrics or {})})
+    run.write_metrics({**_metrics(result, trainer.scene, [initial], seconds), **(more_metrics or {})})
     if figures:
-        for name, figure in draw_registration(result, trainer.scene, trainer.data, initial).items():
+        for name, figure in draw_registration(result, trainer.data, [initial]).items():
             run.write_figure(name, figure)
-    run.write_result(result, inputs.implant.points, initial_to_world=initial)
+    run.write_result(result, [inputs.implant.points], initial_to_world=[initial])
 
 
 class _Checkpoints(Callback):
-    """Writes a checkpoint after each stage."""
+    """Writes a checkpoint after each stage, and every few seconds within one."""
 
     def __init__(self, run: RunFolder) -> None:
-        self.run = run
+        self.run, self.last = run, time.perf_counter()
 
-    def on_stage_end(self, trainer: Trainer, index: int, stage: Any) -> None:
+    def on_iteration(self, trainer: TrainerState, index: int, progress: Progress) -> None:
+        if time.perf_counter() - self.last > _CHECKPOINT_SECONDS:
+            self._save(trainer)
+
+    def on_stage_end(self, trainer: TrainerState, index: int, stage: Stage) -> None:
+        self._save(trainer)
+
+    def _save(self, trainer: TrainerState) -> None:
         self.run.save_checkpoint(trainer.state_dict())
         self.run.write_history(trainer.history)
+        self.last = time.perf_counter()
 
 
 def run_record(files: RegistrationFiles, config: RegistrationConfig) -> dict[str, Any]:
@@ -172,9 +184,12 @@ def _continue(run: RunFolder, trainer: Trainer, record: dict[str, Any]) -> None:
         trainer.load_state_dict(checkpoint)
 
 
-def _metrics(result: RegistrationResult, scene: Scene, initial: Tensor, seconds: float) -> dict[str, Any]:
-    points = scene.implant.points.double()
-    motion = (result.warp(points) - transform_points(initial, points)).norm(dim=-1)
+def _metrics(result: RegistrationResult, scene: Scene, starts: Sequence[Tensor], seconds: float) -> dict[str, Any]:
+    each = []
+    for implant, assembly, start in zip(result.implants, scene, starts, strict=True):
+        points = assembly.implant.points.double()
+        each.append((implant.warp(points) - transform_points(start, points)).norm(dim=-1))
+    motion = torch.cat(each)
     return {
         "status": result.status,
         "gc": result.gc.tolist(),
@@ -182,7 +197,8 @@ def _metrics(result: RegistrationResult, scene: Scene, initial: Tensor, seconds:
         "mean_motion_mm": float(motion.mean()),
         "largest_motion_mm": float(motion.max()),
         "intensity": result.intensity,
-        "screws_found": result.screws,
+        "screws_found": [screw.to_dict() for screw in result.screws_found],
+        "stages": result.stages,
         "diagnostics": {name: v for name, v in result.diagnostics.items() if name not in ("gc", "node_std_mm")},
         "seconds": seconds,
         "warnings": result.warnings,

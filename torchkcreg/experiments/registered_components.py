@@ -9,11 +9,11 @@ import trimesh
 
 from torchkcreg.evaluation import deformed_surface
 from torchkcreg.geometry import fit_rigid, transform_points
-from torchkcreg.implant import ImplantPointCloud, cylinder_mesh
-from torchkcreg.io import ComponentSpec, read_components, read_config, read_mesh, read_run
+from torchkcreg.implant import ImplantPointCloud, Screw
+from torchkcreg.io import read_components, read_config, read_mesh, read_run
 from torchkcreg.reconstruction import KnownComponent
 from torchkcreg.registration import RegistrationResult
-from torchkcreg.registration.scene import followed_points
+from torchkcreg.scene import followed_points
 
 
 def registered_components(
@@ -39,18 +39,9 @@ def registered_components(
     pitch = pitch_mm or float(options.get("pitch_mm", 0.25))
     mesh = read_mesh(files["implant"])
     known = [KnownComponent.from_mesh(deformed_surface(result, mesh, longest_edge_mm=2.0), name, pitch=pitch)]
-    path = components or (Path(files["components"]) if files.get("components") else None)
-    specs = read_components(path) if path is not None else _found_screws(result)
-    screws = [KnownComponent.from_mesh(_placed_screw(s, mesh, result), s.material, pitch=pitch) for s in specs]
-    return [*known, *screws]
-
-
-def _found_screws(result: RegistrationResult) -> list[ComponentSpec]:
-    """The screws that a registration found, under the names their motions are kept by."""
-    return [
-        ComponentSpec(tuple(s["start"]), tuple(s["end"]), s["radius"], s["material"], f"found{i}")
-        for i, s in enumerate(result.screws)
-    ]
+    screws = read_components(components) if components is not None else result.implants[0].screws
+    placed = [KnownComponent.from_mesh(_placed_screw(s, mesh, result), s.material, pitch=pitch) for s in screws]
+    return [*known, *placed]
 
 
 def _record(run: Path) -> tuple[dict, dict]:
@@ -58,15 +49,14 @@ def _record(run: Path) -> tuple[dict, dict]:
     return content.get("files") or {}, content.get("options") or {}
 
 
-def _placed_screw(spec: ComponentSpec, mesh: trimesh.Trimesh, result: RegistrationResult) -> trimesh.Trimesh:
-    screw = cylinder_mesh(spec.start, spec.end, spec.radius)
-    motion = result.components.get(spec.name)
+def _placed_screw(screw: Screw, mesh: trimesh.Trimesh, result: RegistrationResult) -> trimesh.Trimesh:
+    motion = result.components.get(screw.name)
     if motion is None:
         nodes = ImplantPointCloud.from_mesh(mesh, 1.0, dtype=torch.float64).points
-        radius = result.config.follow_radius_mm
-        near = followed_points(nodes, torch.tensor(spec.start, dtype=torch.float64), radius)
+        near = followed_points(nodes, torch.tensor(screw.start, dtype=torch.float64), result.config.follow_radius_mm)
         pose = fit_rigid(near, result.warp(near))
     else:
         pose = result.implant_to_world.double() @ motion.double()
-    vertices = transform_points(pose, torch.from_numpy(screw.vertices.copy()))
-    return trimesh.Trimesh(vertices.numpy(), screw.faces, process=False)
+    own = screw.mesh()
+    vertices = transform_points(pose, torch.from_numpy(own.vertices.copy()))
+    return trimesh.Trimesh(vertices.numpy(), own.faces, process=False)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchkcreg.geometry.checks import checked_matrices, checked_shape
 from torchkcreg.geometry.orientation import looking_signs, turned_towards
+from torchkcreg.precision import ExactModule
 
 
-class ConeBeamGeometry(nn.Module):
+class ConeBeamGeometry(ExactModule):
     """Views of a cone-beam system: ``u = P0.X / P2.X`` (column), ``v = P1.X / P2.X`` (row), X = (x, y, z, 1) in mm.
 
     The matrices are the truth about a view; with ``P = [M | m]``, the source is at ``-M^-1 m`` and the ray of pixel
@@ -42,6 +43,7 @@ class ConeBeamGeometry(nn.Module):
     ([[383.5, 383.5]], [404.0])
     """
 
+    exact_buffers = ("projection_matrices",)
     projection_matrices: Tensor
 
     def __init__(
@@ -85,16 +87,9 @@ class ConeBeamGeometry(nn.Module):
         names = ("det_shape", "pixel_spacing", "sources", "angles_deg", "knows_front")
         fields: dict = {name: getattr(self, name) for name in names}
         geometry = ConeBeamGeometry.__new__(ConeBeamGeometry)
-        nn.Module.__init__(geometry)
+        ExactModule.__init__(geometry)
         geometry._set_up(matrices, **(fields | changes))
         return geometry
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ConeBeamGeometry:
-        exact = self.projection_matrices
-        super()._apply(fn, recurse)
-        if self.projection_matrices.dtype != torch.float64:  # follow .to(device), but not .float()
-            self.projection_matrices = exact.to(self.projection_matrices.device)
-        return self
 
     def extra_repr(self) -> str:
         dv, du = self.pixel_spacing

@@ -20,21 +20,21 @@ _NEGLIGIBLE = 1e-6  # fraction of a cell below which a node is not worth its tim
 class ImplantPointCloud(nn.Module):
     """Nodes of an implant in its own frame, with volumes; in Morton order, so that neighbours are close in memory.
 
-    A node stands for a parallelepiped, the cell of the lattice it comes from, and holds ``masses`` mm^3 of metal.
+    A node stands for a parallelepiped, the cell of the lattice it comes from, and holds ``volumes`` mm^3 of metal.
     Volumes, not attenuation: a projection of the cloud is a path length in mm, and materials enter later.
 
     Args:
         points: (N, 3) in mm, in any order; the buffers hold them in Morton order.
-        masses: (N,) in mm^3, not negative.
+        volumes: (N,) in mm^3, not negative.
         cell: (3, 3), rows are the edge vectors of a cell in mm.
 
     Attributes:
         points: buffer (N, 3).
-        masses: buffer (N,).
+        volumes: buffer (N,).
         cell: buffer (3, 3).
 
     Raises:
-        ValueError: shapes that do not fit, numbers that are not finite, negative masses, or a flat cell.
+        ValueError: shapes that do not fit, numbers that are not finite, negative volumes, or a flat cell.
 
     >>> cloud = ImplantPointCloud.from_mesh(trimesh.creation.box((2.0, 3.0, 10.0)), pitch=0.5)
     >>> cloud
@@ -42,27 +42,27 @@ class ImplantPointCloud(nn.Module):
     """
 
     points: Tensor
-    masses: Tensor
+    volumes: Tensor
     cell: Tensor
 
-    def __init__(self, points: Tensor, masses: Tensor, cell: Tensor) -> None:
+    def __init__(self, points: Tensor, volumes: Tensor, cell: Tensor) -> None:
         super().__init__()
         if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
             raise ValueError(f"points must have shape (N, 3) with N > 0, got {tuple(points.shape)}")
-        if masses.shape != points.shape[:1]:
-            raise ValueError(f"masses must have shape ({len(points)},), got {tuple(masses.shape)}")
+        if volumes.shape != points.shape[:1]:
+            raise ValueError(f"volumes must have shape ({len(points)},), got {tuple(volumes.shape)}")
         if cell.shape != (3, 3):
             raise ValueError(f"cell must have shape (3, 3), got {tuple(cell.shape)}")
-        for name, tensor in (("points", points), ("masses", masses), ("cell", cell)):
+        for name, tensor in (("points", points), ("volumes", volumes), ("cell", cell)):
             if not tensor.is_floating_point() or not bool(tensor.isfinite().all()):
                 raise ValueError(f"{name} must be finite floating-point numbers, got {tensor.dtype}")
-        if bool((masses < 0).any()):
-            raise ValueError(f"masses must not be negative, got {masses.min().item()}")
+        if bool((volumes < 0).any()):
+            raise ValueError(f"volumes must not be negative, got {volumes.min().item()}")
         if not bool(torch.linalg.det(cell.double()).abs() > 0):
             raise ValueError(f"cell must have a volume, got edges {cell.tolist()}")
         order = morton_order(points, cell.to(points.device))
         self.register_buffer("points", points[order])
-        self.register_buffer("masses", masses.to(points)[order])
+        self.register_buffer("volumes", volumes.to(points)[order])
         self.register_buffer("cell", cell.to(points))
         self._coarser: dict[tuple[int, ...], ImplantPointCloud] = {}
 
@@ -109,9 +109,9 @@ class ImplantPointCloud(nn.Module):
         if not kept.any():  # smaller than a cell by far
             kept = fractions > 0
         within = centroids[kept] if at_centroids else 0.5
-        masses = fractions[kept] * pitch**3
+        volumes = fractions[kept] * pitch**3
         points = corner + (indices[kept] + within) * pitch
-        buffers = (torch.from_numpy(array).to(device, dtype) for array in (points, masses, pitch * np.eye(3)))
+        buffers = (torch.from_numpy(array).to(device, dtype) for array in (points, volumes, pitch * np.eye(3)))
         return cls(*buffers)
 
     @classmethod
@@ -126,7 +126,7 @@ class ImplantPointCloud(nn.Module):
     ) -> ImplantPointCloud:
         """Cloud of the voxels of a reconstruction above a threshold, as in Cao et al. 2020 (section 2.4).
 
-        A voxel at the surface is part metal, part air, and its value says how much of each: its mass is the voxel's
+        A voxel at the surface is part metal, part air, and its value says how much of each: its node holds the voxel's
         volume times ``value / metal_value``, at most one. So the threshold should lie well below the metal, just above
         noise and artefacts; at half the metal's value each surface loses the lighter half of its voxels.
 
@@ -163,22 +163,32 @@ class ImplantPointCloud(nn.Module):
 
     @property
     def volume(self) -> float:
-        """Volume of the implant in mm^3, the sum of the masses."""
-        return self.masses.detach().double().sum().item()
+        """Volume of the implant in mm^3, the sum of the volumes."""
+        return self.volumes.detach().double().sum().item()
 
     @property
     def bounds(self) -> Tensor:
         """Smallest and largest coordinates of the nodes, (2, 3) in mm; cells reach half an edge further."""
         return torch.stack([self.points.amin(0), self.points.amax(0)])
 
+    @property
+    def pitch(self) -> float:
+        """Edge in mm of a cube as large as a cell."""
+        return torch.linalg.det(self.cell.double()).abs().item() ** (1 / 3)
+
+    def coarsened_to(self, pitch: float) -> ImplantPointCloud:
+        """The cloud on a lattice of about this pitch in mm, or as it is where that is finer; see `coarsened`."""
+        factor = max(1, round(pitch / self.pitch))
+        return self if factor == 1 else self.coarsened(factor)
+
     def coarsened(self, factor: int) -> ImplantPointCloud:
         """Cloud on a lattice ``factor`` times as coarse: the nodes of ``factor^3`` cells merge at their centroid.
 
-        Masses and centroids are exact, for fast first stages of a registration. Made once and kept: leave it as it is.
+        Volumes and centroids are exact, for fast first stages of a registration. Made once and kept: leave it as it is.
         """
         if int(factor) != factor or factor < 1:
             raise ValueError(f"factor must be a positive integer, got {factor}")
-        buffers = (self.points, self.masses, self.cell)
+        buffers = (self.points, self.volumes, self.cell)
         versions = (0 if b.is_inference() else b._version for b in buffers)  # inference tensors have none
         key = (int(factor), *(b.data_ptr() for b in buffers), *versions)
         if key not in self._coarser:
@@ -189,18 +199,18 @@ class ImplantPointCloud(nn.Module):
     def _coarsened(self, factor: int) -> ImplantPointCloud:
         in_cells = self.points.double() @ torch.linalg.inv(self.cell.double())
         # The heaviest node's cell is full, so that it stands at its centre: surface nodes lie anywhere in theirs.
-        lattice = torch.round(in_cells - in_cells[self.masses.argmax()]).long()
+        lattice = torch.round(in_cells - in_cells[self.volumes.argmax()]).long()
         blocks = torch.div(lattice - lattice.amin(0), factor, rounding_mode="floor")
         size = blocks.amax(0) + 1
         distinct, block = torch.unique(
             (blocks[:, 0] * size[1] + blocks[:, 1]) * size[2] + blocks[:, 2], return_inverse=True
         )
-        masses = self.masses.double()
-        # nodes without mass still have a place
-        weights = masses.clamp_min(1e-12 * masses.max().clamp_min(1e-300))
-        totals = torch.zeros(len(distinct), dtype=torch.float64, device=masses.device).index_add(0, block, weights)
+        volumes = self.volumes.double()
+        # nodes without volume still have a place
+        weights = volumes.clamp_min(1e-12 * volumes.max().clamp_min(1e-300))
+        totals = torch.zeros(len(distinct), dtype=torch.float64, device=volumes.device).index_add(0, block, weights)
         moments = totals.new_zeros(len(distinct), 3).index_add(0, block, weights[:, None] * self.points.double())
-        merged = torch.zeros_like(totals).index_add(0, block, masses)
+        merged = torch.zeros_like(totals).index_add(0, block, volumes)
         return ImplantPointCloud(*(t.to(self.points) for t in (moments / totals[:, None], merged, self.cell * factor)))
 
     def principal_axes(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -209,8 +219,8 @@ class ImplantPointCloud(nn.Module):
         Axes go from the smallest to the largest variance: the third one runs along a plate. The largest component of
         the second and the third axis is positive, and the first one makes the axes a proper rotation.
         """
-        points, masses = self.points.double(), self.masses.double()
-        share = (masses / masses.sum())[:, None]
+        points, volumes = self.points.double(), self.volumes.double()
+        share = (volumes / volumes.sum())[:, None]
         center = (share * points).sum(0)
         centred = points - center
         _, vectors = torch.linalg.eigh((share * centred).mT @ centred)

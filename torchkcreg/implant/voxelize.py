@@ -41,15 +41,15 @@ def voxelize_mesh(mesh: trimesh.Trimesh, grid: VolumeGrid, *, dtype: torch.dtype
     return volume.to(dtype)
 
 
-def voxelize_points(points: Tensor, masses: Tensor, grid: VolumeGrid, *, cell: Tensor | None = None) -> Tensor:
-    """Fraction of each voxel that the nodes of a cloud fill, (D, H, W); differentiable in points and masses.
+def voxelize_points(points: Tensor, volumes: Tensor, grid: VolumeGrid, *, cell: Tensor | None = None) -> Tensor:
+    """Fraction of each voxel that the nodes of a cloud fill, (D, H, W); differentiable in points and volumes.
 
     Each node is cut into parts no larger than a voxel, and each part is shared among the eight voxels around it with
     trilinear weights. So the total volume and its centroid are kept, but edges blur by about a voxel.
 
     Args:
         points: (N, 3) in world mm, wherever a deformation took them.
-        masses: (N,) in mm^3.
+        volumes: (N,) in mm^3.
         grid: the voxels; what falls outside is lost.
         cell: (3, 3) edges of the nodes' cells in rows, in world mm; points without extent if not given.
 
@@ -57,15 +57,15 @@ def voxelize_points(points: Tensor, masses: Tensor, grid: VolumeGrid, *, cell: T
     >>> half.tolist()
     [[[0.5, 0.5]]]
     """
-    if points.ndim != 2 or points.shape[1] != 3 or masses.shape != points.shape[:1]:
+    if points.ndim != 2 or points.shape[1] != 3 or volumes.shape != points.shape[:1]:
         raise ValueError(
-            f"points and masses must have shapes (N, 3) and (N,), got {tuple(points.shape)} and {tuple(masses.shape)}"
+            f"points and volumes must have shapes (N, 3) and (N,), got {tuple(points.shape)} and {tuple(volumes.shape)}"
         )
     to_voxel = grid.world_to_voxel.to(points)
     voxels = transform_points(to_voxel, points)
     edges = torch.zeros_like(to_voxel[:3, :3]) if cell is None else cell.to(points) @ to_voxel[:3, :3].mT
     parts = [max(1, math.ceil(edge - 1e-4)) for edge in edges.detach().abs().amax(1).tolist()]
-    shares = masses / (math.prod(parts) * grid.voxel_volume)
+    shares = volumes / (math.prod(parts) * grid.voxel_volume)
     volume = torch.zeros(grid.num_voxels, dtype=points.dtype, device=points.device)
     for part in itertools.product(*(range(count) for count in parts)):
         offset = points.new_tensor([(i + 0.5) / count - 0.5 for i, count in zip(part, parts)])

@@ -4,7 +4,7 @@ Only this folder touches a disk. What it reads is checked, and an error is one l
 what it writes is there whole or not at all.
 """
 
-from .components import ComponentSpec, read_components, write_components
+from .components import read_components, write_components
 from .config import read_config, write_config
 from .figures import write_figure
 from .files import read_json, write_json
@@ -23,7 +23,6 @@ from .versions import versions
 from .volumes import read_volume, write_volume
 
 __all__ = [
-    "ComponentSpec",
     "Projections",
     "RunFolder",
     "displacement_field",

@@ -4,32 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
+from torchkcreg.implant import Screw
 from torchkcreg.io.files import finite_array, finite_number, read_json, write_json
 
 
-@dataclass(frozen=True)
-class ComponentSpec:
-    """A cylinder: a screw as far as its shadow goes.
-
-    Attributes:
-        start: centre of the end at the screw's head, x, y, z in the implant's frame, mm.
-        end: centre of the other end, its tip.
-        radius: mm.
-        material: name that `torchkcreg.physics.material` knows.
-        name: label, unique in a file.
-    """
-
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
-    radius: float
-    material: str
-    name: str
-
-
-def read_components(path: str | os.PathLike[str]) -> list[ComponentSpec]:
+def read_components(path: str | os.PathLike[str]) -> list[Screw]:
     """The cylinders of a JSON file `{"units": "mm", "screws": [{"from", "to", "radius", "material", "name"}, ...]}`.
 
     `from` is the head's end and `to` the tip, x, y, z in the implant's frame in mm; `material` may stand once for all
@@ -46,25 +27,25 @@ def read_components(path: str | os.PathLike[str]) -> list[ComponentSpec]:
             raise ValueError("must be a JSON object with a list 'screws'")
         if content.get("units", "mm") != "mm":
             raise ValueError(f"units must be mm, got {content['units']!r}")
-        specs = [_spec(screw, i, content.get("material")) for i, screw in enumerate(content["screws"])]
-        names = [spec.name for spec in specs]
+        screws = [_screw(screw, i, content.get("material")) for i, screw in enumerate(content["screws"])]
+        names = [screw.name for screw in screws]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"names must be unique, {twice[0]!r} is there {names.count(twice[0])} times")
     except ValueError as error:
         raise ValueError(f"components file {path}: {error}") from error
-    return specs
+    return screws
 
 
-def write_components(path: str | os.PathLike[str], components: Sequence[ComponentSpec]) -> None:
+def write_components(path: str | os.PathLike[str], screws: Sequence[Screw]) -> None:
     """Nothing; writes cylinders as `read_components` reads them."""
-    screws = [
-        {"name": c.name, "from": list(c.start), "to": list(c.end), "radius": c.radius, "material": c.material}
-        for c in components
+    listed = [
+        {"name": s.name, "from": list(s.start), "to": list(s.end), "radius": s.radius, "material": s.material}
+        for s in screws
     ]
-    write_json(path, {"units": "mm", "frame": "the undeformed implant's", "screws": screws})
+    write_json(path, {"units": "mm", "frame": "the undeformed implant's", "screws": listed})
 
 
-def _spec(screw: Any, i: int, material: Any) -> ComponentSpec:
+def _screw(screw: Any, i: int, material: Any) -> Screw:
     if not isinstance(screw, dict):
         raise ValueError(f"screw {i} must be an object with from, to, radius and material, got {screw!r}")
     for key in ("from", "to", "radius"):
@@ -79,13 +60,8 @@ def _spec(screw: Any, i: int, material: Any) -> ComponentSpec:
     name = screw.get("name", f"screw{i}")
     if not isinstance(name, str) or not name:
         raise ValueError(f"name of screw {i} must be a text, got {name!r}")
-    return ComponentSpec(
-        start=_triple(start.tolist()),
-        end=_triple(end.tolist()),
-        radius=finite_number(screw["radius"], f"radius of screw {i}", positive=True),
-        material=material,
-        name=name,
-    )
+    radius = finite_number(screw["radius"], f"radius of screw {i}", positive=True)
+    return Screw(_triple(start.tolist()), _triple(end.tolist()), radius, material, name)
 
 
 def _triple(values: list[float]) -> tuple[float, float, float]:

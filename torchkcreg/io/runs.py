@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from torchkcreg.deformation import SplineField
 from torchkcreg.geometry import transform_points
 from torchkcreg.io.config import write_config
 from torchkcreg.io.figures import write_figure
@@ -136,29 +138,34 @@ class RunFolder:
         write_figure(self.path / name, figure)
 
     def write_result(
-        self, result: RegistrationResult, points: Tensor, *, initial_to_world: Tensor | None = None
+        self, result: RegistrationResult, points: Sequence[Tensor], *, initial_to_world: Sequence[Tensor] | None = None
     ) -> None:
         """Nothing; writes history, displacement field, ITK transform, deformed cloud and, last, `deformation.json`.
 
+        The files of a second implant, and of more, begin with its name.
+
         Args:
             result: the registration.
-            points: the implant's nodes (N, 3) in its own frame.
-            initial_to_world: pose (4, 4) from which the cloud's displacements are counted; the identity if not given.
+            points: nodes (N, 3) of each implant in its own frame.
+            initial_to_world: pose (4, 4) of each from which the cloud's displacements are counted; the identity if not
+                given.
 
         Raises:
             ValueError: a parameter is not finite.
         """
         content = result_to_dict(result)  # refuses what cannot be written before anything is
-        pose = (
-            torch.eye(4, dtype=torch.float64) if initial_to_world is None else initial_to_world.detach().cpu().double()
-        )
-        moved = warp(result.implant_to_world, result.deformation, points)
-        displacement = moved - transform_points(pose, points.detach().cpu().double())
         (self.path / DEFORMATION).unlink(missing_ok=True)
         self.write_history(result.history)
-        write_displacement_field(self.path / FIELD, result.implant_to_world, result.deformation)
-        write_itk_transform(self.path / TRANSFORM, result.implant_to_world, result.deformation)
-        write_point_cloud_ply(self.path / CLOUD, moved, displacement)
+        starts = initial_to_world or [torch.eye(4, dtype=torch.float64)] * len(result.implants)
+        for number, (implant, nodes, start) in enumerate(zip(result.implants, points, starts, strict=True)):
+            prefix = f"{implant.name}_" if number else ""
+            pose, deformation = implant.implant_to_world, implant.deformation
+            moved = warp(pose, deformation, nodes)
+            displacement = moved - transform_points(start.detach().cpu().double(), nodes.detach().cpu().double())
+            write_displacement_field(self.path / f"{prefix}{FIELD}", pose, deformation, nodes)
+            if isinstance(deformation, SplineField):
+                write_itk_transform(self.path / f"{prefix}{TRANSFORM}", pose, deformation)
+            write_point_cloud_ply(self.path / f"{prefix}{CLOUD}", moved, displacement)
         write_json(self.path / DEFORMATION, content, indent=None)
 
     def read_result(self) -> RegistrationResult:
@@ -179,6 +186,9 @@ class RunFolder:
             leftover.unlink(missing_ok=True)
         for name in names:
             (self.path / name).unlink(missing_ok=True)
+        for name in (FIELD, TRANSFORM, CLOUD) if names else ():  # of further implants
+            for path in self.path.glob(f"*_{name}"):
+                path.unlink()
         if names:
             self._discard_seeds(names)
 

@@ -10,14 +10,14 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import FreeFormDeformation
+from torchkcreg.deformation import Deformation, SplineField
 from torchkcreg.geometry import transform_points
 from torchkcreg.io.files import atomic_path
 
 _DVF_BLOCK = 65536
 
 
-def itk_transform(implant_to_world: Tensor, deformation: FreeFormDeformation) -> sitk.CompositeTransform:
+def itk_transform(implant_to_world: Tensor, deformation: SplineField) -> sitk.CompositeTransform:
     """The ITK transform that maps points of the implant's frame to the world: T(x) = implant_to_world(x + u(x)).
 
     A composite of a cubic `BSplineTransform` on the control-point grid (applied first) and an `AffineTransform` with
@@ -50,48 +50,52 @@ def itk_transform(implant_to_world: Tensor, deformation: FreeFormDeformation) ->
     return sitk.CompositeTransform([rigid, spline])  # ITK applies the last one first
 
 
-def write_itk_transform(
-    path: str | os.PathLike[str], implant_to_world: Tensor, deformation: FreeFormDeformation
-) -> None:
+def write_itk_transform(path: str | os.PathLike[str], implant_to_world: Tensor, deformation: SplineField) -> None:
     """Nothing; writes `itk_transform` as a .tfm that SimpleITK, ITK and 3D Slicer read."""
     with atomic_path(path) as temporary:
         sitk.WriteTransform(itk_transform(implant_to_world, deformation), str(temporary))
 
 
 def displacement_field(
-    implant_to_world: Tensor, deformation: FreeFormDeformation, *, spacing_mm: float = 2.0, margin_mm: float = 15.0
+    implant_to_world: Tensor,
+    deformation: Deformation,
+    points: Tensor,
+    *,
+    spacing_mm: float = 2.0,
+    margin_mm: float = 15.0,
 ) -> sitk.Image:
     """The displacement field T(x) - x as a vector image over the implant's frame, in mm.
 
-    The image lies along the axes of the control-point grid and covers its valid domain plus a margin. Its voxel
+    The image lies along the axes of a spline's grid and covers its valid domain, or along those of the implant's frame
+    and covers the implant, plus a margin. Its voxel
     positions are x in the implant's frame and its vectors lead to the world, T(x) = x + field(x): where the implant was
     modelled in its place (implant frame = world) that is its motion; where it comes from a CAD frame the change of
     frame is in it. Every voxel has what `warp` gives there, also beyond the valid domain.
 
     Args:
         implant_to_world: rigid (4, 4).
-        deformation: displacements of the control points.
+        deformation: of any model.
+        points: nodes (N, 3) of the implant.
         spacing_mm: largest voxel size.
         margin_mm: how far the image reaches beyond the valid domain.
 
     Returns:
         Image of float32 vectors; its index runs along the grid's axes.
     """
-    grid = deformation.grid
-    frame = torch.as_tensor(grid.frame).detach().cpu().double()
+    frame, low, high = _domain(deformation, points)
     starts, steps, counts = [], [], []
-    for n, control_spacing in zip(grid.shape, grid.spacing):
-        length = (int(n) - 3) * float(control_spacing) + 2 * margin_mm
+    for first, last in zip(low, high, strict=True):
+        length = last - first + 2 * margin_mm
         count = max(2, math.ceil(length / spacing_mm) + 1)
-        starts.append(float(control_spacing) - margin_mm)
+        starts.append(first - margin_mm)
         steps.append(length / (count - 1))
         counts.append(count)
     x, y, z = (
         start + step * torch.arange(count, dtype=torch.float64) for start, step, count in zip(starts, steps, counts)
     )
     in_grid = torch.stack(torch.meshgrid(z, y, x, indexing="ij"), dim=-1).flip(-1).reshape(-1, 3)
-    points = transform_points(frame, in_grid)
-    vectors = warp(implant_to_world, deformation, points) - points
+    voxels = transform_points(frame, in_grid)
+    vectors = warp(implant_to_world, deformation, voxels) - voxels
     image = sitk.GetImageFromArray(vectors.float().reshape(*reversed(counts), 3).numpy(), isVector=True)
     image.SetOrigin(transform_points(frame, torch.tensor([starts], dtype=torch.float64))[0].tolist())
     image.SetSpacing(steps)
@@ -99,16 +103,26 @@ def displacement_field(
     return image
 
 
+def _domain(deformation: Deformation, points: Tensor) -> tuple[Tensor, list[float], list[float]]:
+    """Frame (4, 4) of a box, and its two corners there: where the deformation says something."""
+    if isinstance(deformation, SplineField):
+        grid = deformation.grid
+        ends = [(n - 2) * s for n, s in zip(grid.shape, grid.spacing, strict=True)]
+        return torch.as_tensor(grid.frame).detach().cpu().double(), list(grid.spacing), ends
+    nodes = points.detach().cpu().double()
+    return torch.eye(4, dtype=torch.float64), nodes.amin(0).tolist(), nodes.amax(0).tolist()
+
+
 def write_displacement_field(
-    path: str | os.PathLike[str], implant_to_world: Tensor, deformation: FreeFormDeformation
+    path: str | os.PathLike[str], implant_to_world: Tensor, deformation: Deformation, points: Tensor
 ) -> None:
     """Nothing; writes `displacement_field` as an image (.mha, .nrrd), compressed."""
     with atomic_path(path) as temporary:
-        sitk.WriteImage(displacement_field(implant_to_world, deformation), str(temporary), useCompression=True)
+        sitk.WriteImage(displacement_field(implant_to_world, deformation, points), str(temporary), useCompression=True)
 
 
 @torch.no_grad()
-def warp(implant_to_world: Tensor, deformation: FreeFormDeformation, points: Tensor) -> Tensor:
+def warp(implant_to_world: Tensor, deformation: Deformation, points: Tensor) -> Tensor:
     """World positions (N, 3) float64 of points (N, 3) of the implant's frame: implant_to_world(x + u(x))."""
     exact = copy.deepcopy(deformation).cpu().double()
     blocks = points.detach().cpu().double().split(_DVF_BLOCK)

@@ -3,6 +3,7 @@
 from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
 from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
 from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission
+from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
 from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
 from torchkcreg.physics.scatter import scatter_shapes, scattered_signal
 from torchkcreg.physics.spectra import Spectrum, tungsten_spectrum
@@ -10,7 +11,9 @@ from torchkcreg.physics.transmission import polyenergetic_line_integrals
 
 __all__ = [
     "COUNT_FLOOR",
+    "FreeParameter",
     "IdentityIntensity",
+    "IntensityModel",
     "Material",
     "PolyenergeticTransmission",
     "Spectrum",

@@ -9,14 +9,21 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from torchkcreg.physics.blur import gaussian_kernel
+from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
 from torchkcreg.physics.materials import Material, material
 from torchkcreg.physics.scatter import scattered_signal
 from torchkcreg.physics.spectra import Spectrum
 from torchkcreg.physics.transmission import polyenergetic_line_integrals
 from torchkcreg.precision import full_precision
 
+# Standard deviations of where scanners and limbs have these parameters.
+_LIKELY_SCATTER = 0.2
+_LIKELY_BLUR = 0.4  # of the start: focal spots and scintillators
+_LEAST_LIKELY_BLUR_PX = 0.1
+_LIKELY_HARDNESS_MM = {True: 0.5, False: 3.0}  # of aluminium: spectrum known, unknown
 
-class IdentityIntensity(nn.Module):
+
+class IdentityIntensity(IntensityModel):
     """Path lengths as they are, summed over the materials: the model of Cao et al. 2020."""
 
     def forward(self, path_lengths: Tensor, *, pooling: int = 1) -> Tensor:
@@ -33,7 +40,7 @@ class IdentityIntensity(nn.Module):
         return avg_pool2d(total.flatten(0, -3), pooling).unflatten(0, total.shape[:-2])
 
 
-class PolyenergeticTransmission(nn.Module):
+class PolyenergeticTransmission(IntensityModel):
     """Line integrals behind several materials, with beam hardening, the system's blur and a scatter floor.
 
     `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s p + r q) + ln(1 + s)`; zero where nothing stands in the beam. The
@@ -50,6 +57,8 @@ class PolyenergeticTransmission(nn.Module):
         hardness: Filtration added to the spectrum (taken away where negative), mm of aluminium:
             `w_k *= exp(-mu_Al(E_k) hardness)`, normalised again.
         num_bins: The most energies kept; None keeps the spectrum's own.
+        background: A last material that stands for what is not known.
+        spectrum_is_known: The spectrum is the scanner's own, not a likely one: hardness is then known better.
 
     Attributes:
         scatter, scatter_removed, blur_sigma_px, hardness: Scalar parameters, float64, which a fit may move. The
@@ -82,8 +91,29 @@ class PolyenergeticTransmission(nn.Module):
         blur_sigma_px: float = 0.0,
         hardness: float = 0.0,
         num_bins: int | None = 20,
+        background: Material | None = None,
+        spectrum_is_known: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            {
+                "scatter": FreeParameter("scatter", 0.05, 0.0, 0.9, scatter, _LIKELY_SCATTER),
+                "removed": FreeParameter("scatter_removed", 0.05, 0.0, 0.9, scatter_removed, _LIKELY_SCATTER),
+                "blur": FreeParameter(
+                    "blur_sigma_px",
+                    0.5,
+                    0.1,
+                    5.0,
+                    blur_sigma_px,
+                    max(_LIKELY_BLUR * blur_sigma_px, _LEAST_LIKELY_BLUR_PX),
+                    in_pixels=True,
+                ),
+                "hardness": FreeParameter(
+                    "hardness", 2.0, -5.0, 20.0, hardness, _LIKELY_HARDNESS_MM[spectrum_is_known]
+                ),
+            }
+        )
+        self.has_background = background is not None
+        materials = [*materials, background] if background is not None else list(materials)
         if not materials:
             raise ValueError("materials must hold at least one material, got none")
         named = {"scatter": scatter, "scatter_removed": scatter_removed, "blur_sigma_px": blur_sigma_px}

@@ -19,7 +19,7 @@ class Footprint:
 
     Args:
         table: shape (V, num_blocks, R + 1, R + 1, T, T). Entry ``[view, block, pv, pu]`` holds the T x T pixel values
-            of a node of mass 1 that sits ``pv / R`` and ``pu / R`` of a pixel beyond the pixel of tap ``T / 2 - 1``.
+            of a node of 1 mm^3 that sits ``pv / R`` and ``pu / R`` of a pixel beyond the pixel of tap ``T / 2 - 1``.
             The T x T taps sum to one at every phase.
         block_size: how many consecutive nodes share a table; the last block may be shorter.
     """

@@ -21,7 +21,7 @@ __all__ = ["choose_backend", "load_operators", "point_drr"]
 
 def point_drr(
     points: Tensor,
-    masses: Tensor,
+    volumes: Tensor,
     matrices: Tensor,
     table: Tensor,
     block_size: int,
@@ -38,8 +38,8 @@ def point_drr(
     """
     kernel = _PointDrr(table, block_size, rows, cols)
     if choose_backend(points, backend) == "cpp":
-        return differentiable(kernel, points, masses, matrices)
-    return kernel.reference(points, masses, matrices)
+        return differentiable(kernel, points, volumes, matrices)
+    return kernel.reference(points, volumes, matrices)
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,17 @@ class _PointDrr:
     rows: int
     cols: int
 
-    def forward(self, points: Tensor, masses: Tensor, matrices: Tensor) -> Tensor:
+    def forward(self, points: Tensor, volumes: Tensor, matrices: Tensor) -> Tensor:
         return torch.ops.torchkcreg.point_drr(
-            points, masses, matrices, self.table, self.block_size, self.rows, self.cols
+            points, volumes, matrices, self.table, self.block_size, self.rows, self.cols
         )
 
     def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
         found = torch.ops.torchkcreg.point_drr_backward(gradient, *inputs, self.table, self.block_size, *needed[1:])
         return [g if need else None for g, need in zip(found, needed)]
 
-    def reference(self, points: Tensor, masses: Tensor, matrices: Tensor) -> Tensor:
-        return splat_points(points, masses, matrices, self.table, self.block_size, self.rows, self.cols)
+    def reference(self, points: Tensor, volumes: Tensor, matrices: Tensor) -> Tensor:
+        return splat_points(points, volumes, matrices, self.table, self.block_size, self.rows, self.cols)
 
 
 def register() -> None:
@@ -71,7 +71,7 @@ def register() -> None:
 
 
 def _fake_forward(
-    points: Tensor, masses: Tensor, matrices: Tensor, table: Tensor, block_size: int, rows: int, cols: int
+    points: Tensor, volumes: Tensor, matrices: Tensor, table: Tensor, block_size: int, rows: int, cols: int
 ) -> Tensor:
     return points.new_empty(points.shape[0], matrices.shape[0], rows, cols)
 
@@ -79,15 +79,15 @@ def _fake_forward(
 def _fake_backward(
     grad: Tensor,
     points: Tensor,
-    masses: Tensor,
+    volumes: Tensor,
     matrices: Tensor,
     table: Tensor,
     block_size: int,
-    need_masses: bool,
+    need_volumes: bool,
     need_matrices: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     return (
         points.new_empty(points.shape),
-        masses.new_empty(masses.shape if need_masses else (0,)),
+        volumes.new_empty(volumes.shape if need_volumes else (0,)),
         matrices.new_empty(matrices.shape if need_matrices else (0,)),
     )

@@ -14,7 +14,7 @@ from .ops import choose_backend, point_drr
 @full_precision
 def project_points(
     points: Tensor,  # (..., N, 3)
-    masses: Tensor,  # (N,)
+    volumes: Tensor,  # (N,)
     projection_matrices: Tensor,  # (V, 3, 4)
     det_shape: tuple[int, int],
     *,
@@ -30,14 +30,14 @@ def project_points(
     DRR of a lattice that fills a body is the body's path length. Nodes behind the source or with NaN coordinates are
     skipped, and a footprint that leaves the detector loses just that part.
 
-    Differentiable in points, masses and projection matrices, in both modes and any order; the shape of the footprint
+    Differentiable in points, volumes and projection matrices, in both modes and any order; the shape of the footprint
     counts as constant, and it is piecewise bilinear: second derivatives are those between its kinks. Under
     `torch.autocast` it computes in float32. The images have the dtype of the points, whatever that of the matrices.
 
     Args:
         points: nodes in world mm, shape (..., N, 3); leading axes are candidates. Neighbours in memory should be
             neighbours in space (Morton order): that makes footprints exact and the projection fast.
-        masses: volume of each node in mm^3, shape (N,).
+        volumes: volume of each node in mm^3, shape (N,).
         projection_matrices: shape (V, 3, 4), world mm to homogeneous 0-based pixels; row 2 yields the depth in mm.
         det_shape: (rows, cols) of the detector.
         cell: edge vectors (rows) of the cell that a node stands for, in world mm; one matrix, or one for each block of
@@ -60,7 +60,7 @@ def project_points(
     >>> round(float(drr[0, 32, 32]), 3)
     0.5
     """
-    _check_points(points, masses, projection_matrices, det_shape)
+    _check_points(points, volumes, projection_matrices, det_shape)
     choose_backend(points, backend)  # a wrong name should not wait for the footprint
     if footprint is None and cell is not None:
         footprint = cell_footprint(points, cell, projection_matrices)
@@ -71,7 +71,7 @@ def project_points(
     rows, cols = det_shape
     images = point_drr(
         points.reshape(-1, *points.shape[-2:]),
-        masses.to(points.dtype),
+        volumes.to(points.dtype),
         projection_matrices.to(points.dtype),
         footprint.table.detach().to(points.dtype),
         footprint.block_size,
@@ -102,16 +102,16 @@ def pixel_factors(projection_matrices: Tensor, det_shape: tuple[int, int], *, dt
     return torch.addcmul(along_u + along_v, 2 * gram[:, 0, 1] * v, u).sqrt()
 
 
-def _check_points(points: Tensor, masses: Tensor, matrices: Tensor, det_shape: tuple[int, int]) -> None:
+def _check_points(points: Tensor, volumes: Tensor, matrices: Tensor, det_shape: tuple[int, int]) -> None:
     if points.dim() < 2 or points.shape[-1] != 3 or points.shape[-2] == 0:
         raise ValueError(f"points must have shape (..., N, 3) with N > 0, got {tuple(points.shape)}")
     if points.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"points must be float32 or float64, got {points.dtype}")
-    if masses.shape != points.shape[-2:-1]:
-        raise ValueError(f"masses must have shape ({points.shape[-2]},), got {tuple(masses.shape)}")
+    if volumes.shape != points.shape[-2:-1]:
+        raise ValueError(f"volumes must have shape ({points.shape[-2]},), got {tuple(volumes.shape)}")
     if matrices.dim() != 3 or matrices.shape[1:] != (3, 4):
         raise ValueError(f"projection_matrices must have shape (V, 3, 4), got {tuple(matrices.shape)}")
-    for name, tensor in (("masses", masses), ("projection_matrices", matrices)):
+    for name, tensor in (("volumes", volumes), ("projection_matrices", matrices)):
         if not tensor.is_floating_point():
             raise ValueError(f"{name} must be floating point, got {tensor.dtype}")
         if tensor.device != points.device:
@@ -146,13 +146,13 @@ class PointCloudProjector(nn.Module):
         self.backend = backend
 
     def forward(
-        self, points: Tensor, masses: Tensor, *, cell: Tensor | None = None, footprint: Footprint | None = None
+        self, points: Tensor, volumes: Tensor, *, cell: Tensor | None = None, footprint: Footprint | None = None
     ) -> Tensor:
         """Path lengths (..., V, rows, cols) in mm of points (..., N, 3); see `project_points`."""
         geometry = self.geometry
         return project_points(
             points,
-            masses,
+            volumes,
             geometry.projection_matrices,
             geometry.det_shape,
             cell=cell,

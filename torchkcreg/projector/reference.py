@@ -10,32 +10,32 @@ MIN_DEPTH = 1e-3  # mm; nothing stands nearer to the focal spot, and its amplitu
 
 def splat_points(
     points: Tensor,  # (B, N, 3)
-    masses: Tensor,  # (N,)
+    volumes: Tensor,  # (N,)
     matrices: Tensor,  # (V, 3, 4)
     table: Tensor,  # (V, num_blocks, R + 1, R + 1, T, T)
     block_size: int,
     rows: int,
     cols: int,
 ) -> Tensor:
-    """Images (B, V, rows, cols) of nodes that each spread ``mass / depth^2`` over the taps of their footprint.
+    """Images (B, V, rows, cols) of nodes that each spread ``volume / depth^2`` over the taps of their footprint.
 
     A node at pixel (u, v) reaches the T x T pixels from ``floor(u) - T / 2 + 1`` and ``floor(v) - T / 2 + 1`` on. Their
     values are the bilinear interpolation of the table in the node's sub-pixel position. Nodes behind the source or with
     NaN coordinates are skipped; pixels beyond the detector are lost.
 
-    Differentiable in points, masses and matrices by autograd; the table is a constant. Any device; on a GPU the order
+    Differentiable in points, volumes and matrices by autograd; the table is a constant. Any device; on a GPU the order
     of the sums, so the last bits, may differ from run to run.
     """
     images = []
     for candidate in points:
         for matrix, view_table in zip(matrices, table):
-            images.append(_splat_view(candidate, masses, matrix, view_table, block_size, rows, cols))
+            images.append(_splat_view(candidate, volumes, matrix, view_table, block_size, rows, cols))
     shape = (len(points), len(matrices), rows, cols)
     return torch.stack(images).reshape(shape) if images else points.new_zeros(shape)
 
 
 def _splat_view(
-    points: Tensor, masses: Tensor, matrix: Tensor, table: Tensor, block_size: int, rows: int, cols: int
+    points: Tensor, volumes: Tensor, matrix: Tensor, table: Tensor, block_size: int, rows: int, cols: int
 ) -> Tensor:
     taps, phases = table.shape[-1], table.shape[1] - 1
     u, v, depth, node = _visible_pixels(points, matrix, taps, rows, cols)
@@ -48,7 +48,7 @@ def _splat_view(
         for step_u, share_u in ((0, 1 - weight_u), (1, weight_u)):
             corner = table[block, phase_v + step_v, phase_u + step_u]
             value = value + (share_v * share_u)[:, None, None] * corner
-    value = value * (masses[node] / depth**2)[:, None, None]
+    value = value * (volumes[node] / depth**2)[:, None, None]
 
     # A frame of T pixels around the image takes what falls beside it, so that no tap needs a bounds check.
     tap = torch.arange(taps, device=points.device)

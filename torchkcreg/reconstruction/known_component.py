@@ -47,7 +47,7 @@ class KnownComponent:
         """Share of each voxel that it fills, (D, H, W)."""
         if self.mesh is not None:
             return voxelize_mesh(self.mesh, grid)
-        return voxelize_points(self.cloud.points, self.cloud.masses, grid, cell=self.cloud.cell).clamp(0, 1)
+        return voxelize_points(self.cloud.points, self.cloud.volumes, grid, cell=self.cloud.cell).clamp(0, 1)
 
 
 def known_materials(components: Sequence[KnownComponent]) -> list[str]:
@@ -79,7 +79,7 @@ def component_path_lengths(
         for cloud in clouds:
             total += project_points(
                 cloud.points.float(),
-                cloud.masses.float(),
+                cloud.volumes.float(),
                 fine.projection_matrices.float(),
                 fine.det_shape,
                 cell=cloud.cell.float(),

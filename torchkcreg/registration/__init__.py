@@ -1,32 +1,44 @@
 """Registration: the objective, its optimisers and the coarse-to-fine loop."""
 
-from .background import with_background
-from .callbacks import Callback, ProgressBar
+from torchkcreg.scene import RegistrationData, Scene, with_background
+
+from .callbacks import Callback, ProgressBar, TrainerState
 from .config import RegistrationConfig, Stage, preset_stages
-from .data import RegistrationData
-from .model import StageModel
-from .objective import StageObjective, stage_objective
-from .register import build_scene, register
-from .result import RegistrationResult
-from .scene import Scene
+from .objective import Objective
+from .optimizer import Optimizer, Progress
+from .optimizers import OPTIMIZERS
+from .register import Implant, build_scene, register
+from .result import RegisteredImplant, RegistrationResult
 from .screws import find_screws
-from .trainer import Trainer
+from .stage_run import StageRun, Terms, similarities
+from .steps import AFTER, BEFORE
+from .trainer import StageRecord, Trainer
 
 __all__ = [
+    "AFTER",
+    "BEFORE",
+    "OPTIMIZERS",
     "Callback",
+    "Implant",
+    "Objective",
+    "Optimizer",
+    "Progress",
     "ProgressBar",
+    "RegisteredImplant",
     "RegistrationConfig",
     "RegistrationData",
     "RegistrationResult",
     "Scene",
     "Stage",
-    "StageModel",
-    "StageObjective",
+    "StageRecord",
+    "StageRun",
+    "Terms",
     "Trainer",
+    "TrainerState",
     "build_scene",
     "find_screws",
     "preset_stages",
     "register",
-    "stage_objective",
+    "similarities",
     "with_background",
 ]

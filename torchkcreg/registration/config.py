@@ -6,9 +6,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-OptimizerName = Literal["gauss-newton", "cmaes", "adam"]
+from torchkcreg.deformation import BendingPrior, Level
+
+SimilarityName = Literal["gradient-correlation", "gradient-difference"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
-NuisanceName = Literal["scatter", "removed", "blur", "hardness"]
 
 _COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
 
@@ -25,25 +26,19 @@ class Stage(BaseModel):
         oversampling: DRRs are rendered on pixels this many times finer and averaged as intensities: the mean of
             exponentials is not the exponential of the mean, and depth hangs on the difference.
         pitch_factor: The implant's nodes are merged on a lattice this many times coarser.
-        optimizer: "gauss-newton", "cmaes" or "adam".
+        similarity: "gradient-correlation", or "gradient-difference", to which the images' contrast counts too and not
+            only its shape; where DRRs are plain path lengths it is gradient correlation.
+        optimizer: Name in :data:`OPTIMIZERS`: "gauss-newton", "cmaes" or "adam".
         iterations: At most this many iterations (generations of CMA-ES).
         tolerance: The stage ends when an iteration moves the implant by less, mm (CMA-ES: the spread of a generation).
         step_mm: Initial step: CMA-ES standard deviation, Adam learning rate, largest Gauss-Newton step.
         population: Candidates of a CMA-ES generation.
         margin_mm: What is seen around the implant's projection, mm at the detector; None: the whole detector.
-        background: Before the stage, what the model lacks (bone, water) is estimated as a smooth path length, and DRRs
-            include it.
-        slide: After a stage of one group, the implant is tried all along its long axis; where it fits elsewhere too,
-            the rigid stages run from each place, and what explains the images best goes on.
-        screws: Where no components are given: screws are looked for in the implant's holes before the stage ("find"),
-            and their lengths and radii are estimated along; they are found in every metal, the stage runs with each,
-            and what explains the images best stays ("choose"); or those found before are estimated along ("fit").
-        tilts: Components may turn a little about their heads, see :class:`ComponentTilts`.
-        robust: Before the stage, pixels are weighted by how well the model explains them, see ``residual_weights``.
-        contrast: The images' contrast counts too (:class:`torchkcreg.similarity.GradientDifference`), not only its
-            shape (gradient correlation).
-        estimate: Parameters of the intensity model that are estimated along, with priors about where they start:
-            "scatter" that comes with what passes, "removed" (scatter of what is removed), "blur", "hardness".
+        estimate: What is estimated beside the motion. Of the intensity model: "scatter" that comes with what passes,
+            "removed" (scatter of what is removed), "blur", "hardness", with priors about where they start. "screws":
+            lengths and radii of those that were found. "tilts": components may turn a little about their heads.
+        before: Steps before the stage's optimiser, by their names in :data:`STEPS`.
+        after: Steps after it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -53,19 +48,21 @@ class Stage(BaseModel):
     bin: int = Field(1, ge=1, le=64)
     oversampling: int = Field(2, ge=1, le=8)
     pitch_factor: int = Field(1, ge=1, le=16)
-    optimizer: OptimizerName = "gauss-newton"
+    similarity: SimilarityName = "gradient-correlation"
+    optimizer: str = "gauss-newton"
     iterations: int = Field(20, ge=1)
     tolerance: float = Field(0.002, gt=0)
     step_mm: float = Field(1.0, gt=0)
     population: int = Field(40, ge=4)
     margin_mm: float | None = Field(6.0, ge=0)
-    background: bool = False
-    slide: bool = False
-    screws: Literal["find", "choose", "fit"] | None = None
-    tilts: bool = False
-    robust: bool = False
-    contrast: bool = False
-    estimate: tuple[NuisanceName, ...] = ()
+    estimate: tuple[str, ...] = ()
+    before: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
+
+    @property
+    def level(self) -> Level:
+        """How finely the deformation moves."""
+        return Level(self.groups, self.modes)
 
     def binning(self, pixel_mm: float) -> int:
         """How many of a detector's pixels are averaged along each side."""
@@ -73,7 +70,7 @@ class Stage(BaseModel):
 
     @model_validator(mode="after")
     def _slides_as_one(self) -> Stage:
-        if self.slide and (self.groups > 1 or self.modes is not None):
+        if "slide" in self.after and not self.level.is_rigid:
             raise ValueError(f"only a stage of one group can slide, this one has {self.groups} groups")
         return self
 
@@ -97,18 +94,22 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         step_mm=4.0,
         population=16,
         margin_mm=25.0,
-        slide=True,
-        screws="find",
+        estimate=("screws",),
+        before=("find_screws",),
+        after=("slide",),
     )
-    physics: tuple[NuisanceName, ...] = ("scatter", "removed", "blur", "hardness")
-    seen = {"pitch_factor": 2, "background": True, "contrast": True}
+    physics = ("scatter", "removed", "blur", "hardness")
+    parts, every = ("screws", "tilts"), ("screws", "tilts", *physics)
+    seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
+    fine = {"estimate": every, "before": ("background", "reweight"), **seen}
+    hardness = ("scatter", "removed", "hardness")  # coarse pixels do not tell blur
     levels = [
-        Stage(bin=8, pitch_factor=4, screws="find", tilts=True),
-        Stage(bin=4, screws="find", tilts=True, estimate=("scatter", "removed", "hardness"), **seen),
-        Stage(groups=2, bin=4, screws="choose", tilts=True, estimate=physics, **seen),
-        Stage(groups=2, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
-        Stage(groups=20, modes=40, bin=2, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
-        Stage(groups=20, modes=40, bin=1, estimate=physics, robust=True, screws="fit", tilts=True, **seen),
+        Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts),
+        Stage(bin=4, before=("find_screws", "background"), estimate=(*parts, *hardness), **seen),
+        Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen),
+        Stage(groups=2, bin=2, **fine),
+        Stage(groups=20, modes=40, bin=2, **fine),
+        Stage(groups=20, modes=40, bin=1, **fine),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
@@ -117,7 +118,15 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
             Stage(groups=2, bin=4, pitch_factor=2, step_mm=0.3, tolerance=0.01, **evolve),
             Stage(groups=2, bin=2, pitch_factor=4, step_mm=0.1, tolerance=0.01, estimate=physics, **evolve),
             *(
-                Stage(groups=groups, bin=2, pitch_factor=4, step_mm=0.05, tolerance=0.005, background=True, **evolve)
+                Stage(
+                    groups=groups,
+                    bin=2,
+                    pitch_factor=4,
+                    step_mm=0.05,
+                    tolerance=0.005,
+                    before=("background",),
+                    **evolve,
+                )
                 for groups in (4, 6, 8, 10)
             ),
         ]
@@ -190,6 +199,11 @@ class RegistrationConfig(BaseModel):
         if counts != sorted(counts):
             raise ValueError(f"groups only split: their number must not fall from stage to stage, got {counts}")
         return stages
+
+    @property
+    def bending_prior(self) -> BendingPrior:
+        """What speaks against bending."""
+        return BendingPrior(self.beta, self.stiffness, self.load_weight, self.youngs_modulus_gpa)
 
     def schedule(self) -> tuple[Stage, ...]:
         """The stages that will run."""

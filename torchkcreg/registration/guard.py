@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchkcreg.geometry import transform_points, vector_from_rotation
+from torchkcreg.scene import Assembly, RegistrationData, Scene
+from torchkcreg.similarity import GradientCorrelation, GradientDifference
 
 from .config import RegistrationConfig, Stage
-from .data import RegistrationData
-from .objective import stage_objective
-from .scene import Scene
+from .stage_run import data_with_background
 
 _PIXEL_MM = 1.5  # nothing finer is needed to see that a stage went astray
 _LOST = 1.25  # times what was unexplained before: a stage sees other pixels than its judge
 _NEGLIGIBLE = 0.01  # of the images
+_MARGIN_MM = 12.0
 _LARGEST_STRAIN = 0.02  # root mean square; metal yields at a tenth of it
 _LARGEST_TURN_DEG = 60.0
 _FURTHEST = 1.5  # lengths of the implant
+_NODES_PITCH_MM = 2.0
 
 
 class Guard:
@@ -28,13 +31,22 @@ class Guard:
     Args:
         scene: As it is before the stages.
         data: Projections, with the shape of the scatter.
-        config: Background, backend.
+        config: Background.
     """
 
     def __init__(self, scene: Scene, data: RegistrationData, config: RegistrationConfig) -> None:
         self.scene, self.data, self.config = scene, data, config
-        self.first_pose = scene.implant_to_world.clone()
+        self.first_poses = [assembly.implant_to_world.clone() for assembly in scene]
         self.bin, self.misfit = 0, math.nan
+        self.kept: dict[str, Any] = {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """What it goes by, as tensors and plain types."""
+        return {"kept": self.kept, "bin": self.bin, "misfit": self.misfit}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes by that from now on."""
+        self.kept, self.bin, self.misfit = state["kept"], state["bin"], state["misfit"]
 
     def before(self, stage: Stage) -> None:
         """The scene's present state is the one to go back to, and what it explains the mark."""
@@ -45,14 +57,14 @@ class Guard:
 
     def after(self) -> str | None:
         """Why the stage was undone, or None where it stands."""
-        reason = implausible(self.scene, self.first_pose)
+        reason = implausible(self.scene, self.first_poses)
         if reason is None:
             now = misfit(self.scene, self.data, self.config, self.bin)
             if now <= _LOST * self.misfit + _NEGLIGIBLE or (math.isfinite(now) and not math.isfinite(self.misfit)):
                 self.misfit = now
                 return None
             reason = f"it left {100 * now:.1f} % of the images unexplained, {100 * self.misfit:.1f} % before"
-        self.scene.restore(self.kept, self.config.pitch_mm)
+        self.scene.restore(self.kept)
         return reason
 
 
@@ -62,34 +74,38 @@ def misfit(scene: Scene, data: RegistrationData, config: RegistrationConfig, bin
 
     1 - GD with the background that goes with the scene, or 1 - GC where DRRs are path lengths; all pixels alike.
     """
-    stage = Stage(groups=scene.num_groups, bin=bin, pitch_factor=2, margin_mm=12.0, background=True, contrast=True)
-    objective = stage_objective(scene, data, stage, config)
-    return 1 - float(objective.similarities(objective.model.at_rest).mean())
+    bin = Stage(bin=bin).binning(data.geometry.pixel_spacing[1])
+    make: type[GradientCorrelation] | type[GradientDifference] = GradientCorrelation
+    if scene.intensity.has_background:
+        data, make = data_with_background(scene, data, config, bin), GradientDifference
+    view = scene.view(data, bin=bin, pitch_factor=2, margin_mm=_MARGIN_MM)
+    return 1 - float(make(view.images.line_integrals, view.images.mask)(scene(view)).mean())
 
 
 @torch.no_grad()
-def rms_strain(scene: Scene) -> float:
-    """Root mean square of the strain in the implant."""
-    cloud = scene.implant.coarsened(8)
-    gradients = scene.deformation.jacobian(cloud.points.double())
+def rms_strain(assembly: Assembly) -> float:
+    """Root mean square of the strain in an implant."""
+    cloud = assembly.implant.coarsened_to(_NODES_PITCH_MM)
+    gradients = assembly.deformation.jacobian(cloud.points.double())
     strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(gradients))
-    share = (cloud.masses / cloud.masses.sum()).double()
+    share = (cloud.volumes / cloud.volumes.sum()).double()
     return float((strain.square().sum((-2, -1)) * share).sum().sqrt())
 
 
-def implausible(scene: Scene, start: Tensor) -> str | None:
-    """Why a scene cannot be one that began at pose ``start`` (4, 4); None if it can."""
-    if not all(bool(torch.isfinite(value).all()) for value in scene.moving_state().values()):
+def implausible(scene: Scene, starts: list[Tensor]) -> str | None:
+    """Why a scene cannot be one whose implants began at these poses (4, 4); None if it can."""
+    values = [*scene.parameters(), *(a.implant_to_world for a in scene)]
+    if not all(bool(torch.isfinite(value).all()) for value in values):
         return "its parameters are not finite"
-    points = scene.implant.points.double()
-    moved = transform_points(scene.implant_to_world, points) - transform_points(start, points)
-    extent = float((points.amax(0) - points.amin(0)).norm())
-    shift = float(moved.mean(0).norm())
-    turned = scene.implant_to_world[:3, :3] @ start[:3, :3].T
-    turn = math.degrees(float(vector_from_rotation(turned).norm()))
-    if shift > _FURTHEST * extent or turn > _LARGEST_TURN_DEG:
-        return f"the implant moved by {shift:.0f} mm and {turn:.0f} degrees"
-    strain = rms_strain(scene)
-    if not strain <= _LARGEST_STRAIN:
-        return f"the implant is strained by {100 * strain:.1f} %, far beyond what metal bears"
+    for assembly, start in zip(scene, starts, strict=True):
+        points = assembly.implant.points.double()
+        moved = transform_points(assembly.implant_to_world, points) - transform_points(start, points)
+        extent = float((points.amax(0) - points.amin(0)).norm())
+        shift = float(moved.mean(0).norm())
+        turned = assembly.implant_to_world[:3, :3] @ start[:3, :3].T
+        turn = math.degrees(float(vector_from_rotation(turned).norm()))
+        if shift > _FURTHEST * extent or turn > _LARGEST_TURN_DEG:
+            return f"the {assembly.name} moved by {shift:.0f} mm and {turn:.0f} degrees"
+        if not (strain := rms_strain(assembly)) <= _LARGEST_STRAIN:
+            return f"the {assembly.name} is strained by {100 * strain:.1f} %, far beyond what metal bears"
     return None

@@ -2,72 +2,130 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchkcreg.deformation import FreeFormDeformation, default_grid
+from torchkcreg.deformation import Deformation, FreeFormDeformation, default_grid
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
-from torchkcreg.physics import IdentityIntensity, PolyenergeticTransmission, Spectrum, material, tungsten_spectrum
+from torchkcreg.physics import (
+    IdentityIntensity,
+    IntensityModel,
+    PolyenergeticTransmission,
+    Spectrum,
+    material,
+    tungsten_spectrum,
+)
+from torchkcreg.scene import Assembly, RegistrationData, Scene
 
 from .callbacks import Callback
 from .config import RegistrationConfig
-from .data import RegistrationData
+from .objective import Penalty, SimilarityFactory
+from .optimizers import OptimizerFactory
 from .result import RegistrationResult
-from .scene import Scene
+from .stage_run import Step, Terms
 from .trainer import Trainer
+
+DeformationFactory = Callable[[ImplantPointCloud, RegistrationConfig], Deformation]
+
+
+@dataclass(frozen=True)
+class Implant:
+    """An implant as a registration is told of it.
+
+    Attributes:
+        cloud: Undeformed implant in its own frame.
+        components: Screws and the like, in the implant's frame; each follows the implant near its head.
+        holes: Its holes, see :func:`torchkcreg.implant.find_holes`: where no components are given, screws are looked
+            for in them.
+        implant_to_world: Approximate pose (4, 4); the identity when None.
+        material: Name of its material; that of the options when None.
+        name: How results refer to it.
+    """
+
+    cloud: ImplantPointCloud
+    components: Sequence[Component] = ()
+    holes: Sequence[Hole] = ()
+    implant_to_world: Tensor | None = None
+    material: str | None = None
+    name: str = "implant"
+
+
+def free_form(cloud: ImplantPointCloud, config: RegistrationConfig) -> FreeFormDeformation:
+    """The free-form deformation that a configuration describes, around an implant."""
+    grid = default_grid(cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
+    return FreeFormDeformation(grid, prior=config.bending_prior)
 
 
 def build_scene(
-    implant: ImplantPointCloud,
+    implants: ImplantPointCloud | Implant | Sequence[Implant],
     config: RegistrationConfig,
     *,
     spectrum: Spectrum | None = None,
     components: Sequence[Component] = (),
     implant_to_world: Tensor | None = None,
     holes: Sequence[Hole] = (),
+    deformation: DeformationFactory = free_form,
+    intensity: IntensityModel | None = None,
 ) -> Scene:
-    """The scene of a registration at its start pose.
+    """The scene of a registration at its start.
 
     Args:
-        implant: Undeformed implant in its own frame.
+        implants: Undeformed implant in its own frame; or several, each with what is fixed to it.
         config: Options; with ``material`` the DRR is polyenergetic, without it a plain path length.
         spectrum: Detected spectrum; a 90 kV tungsten spectrum when None.
-        components: Screws and the like in the implant's frame.
-        implant_to_world: Approximate pose (4, 4); the identity when None.
-        holes: The implant's holes, where screws are looked for if no components are given.
+        components: Of the one implant, see :class:`Implant`.
+        implant_to_world: Of the one implant.
+        holes: Of the one implant.
+        deformation: Makes the deformation of an implant.
+        intensity: Model in place of the one that the options describe; its path lengths are those of the implants'
+            materials, in their order, then of screws' materials, then of components' materials.
+
+    Raises:
+        ValueError: If several implants come with components, a pose or holes of one.
     """
-    grid = default_grid(implant.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
-    pose = torch.eye(4, dtype=torch.float64) if implant_to_world is None else implant_to_world
-    name = config.material or "implant"
-    holes = holes if config.find_screws and not components else ()
-    metals = config.screw_materials if holes and config.material is not None else ()
-    names = list(dict.fromkeys([name, *metals, *(c.material for c in components)]))
-    intensity: nn.Module = IdentityIntensity()
-    if config.material is not None:
-        intensity = PolyenergeticTransmission(
-            [material(n) for n in [*names, config.background_material]],
-            spectrum or tungsten_spectrum(),
-            scatter=config.scatter,
-            blur_sigma_px=config.blur_px,
+    if isinstance(implants, ImplantPointCloud):
+        implants = Implant(implants, components, holes, implant_to_world)
+    elif components or holes or implant_to_world is not None:
+        raise ValueError("components, holes and implant_to_world belong into each Implant where those are given")
+    several = [implants] if isinstance(implants, Implant) else list(implants)
+    default = config.material or "implant"
+    assemblies = [
+        Assembly(
+            one.cloud,
+            deformation(one.cloud, config),
+            implant_to_world=one.implant_to_world,
+            material=one.material or default,
+            components=one.components,
+            holes=one.holes if config.find_screws and not one.components else (),
+            follow_radius_mm=config.follow_radius_mm,
+            name=one.name,
         )
-    return Scene(
-        implant,
-        FreeFormDeformation(grid),
-        intensity,
-        pose,
-        components=components,
-        material=name,
-        follow_radius_mm=config.follow_radius_mm,
-        holes=holes,
-        metals=metals,
-        knows_spectrum=spectrum is not None,
+        for one in several
+    ]
+    looks = any(assembly.holes for assembly in assemblies) and config.material is not None
+    scene = Scene(assemblies, metals=config.screw_materials if looks else (), backend=config.backend)
+    scene.intensity = intensity or _intensity(scene.materials, config, spectrum)
+    return scene.to(several[0].cloud.points.device)
+
+
+def _intensity(names: Sequence[str], config: RegistrationConfig, spectrum: Spectrum | None) -> IntensityModel:
+    if config.material is None:
+        return IdentityIntensity()
+    return PolyenergeticTransmission(
+        [material(name) for name in names],
+        spectrum or tungsten_spectrum(),
+        scatter=config.scatter,
+        blur_sigma_px=config.blur_px,
+        background=material(config.background_material),
+        spectrum_is_known=spectrum is not None,
     )
 
 
 def register(
-    implant: ImplantPointCloud,
+    implants: ImplantPointCloud | Implant | Sequence[Implant],
     data: RegistrationData,
     config: RegistrationConfig | None = None,
     *,
@@ -75,28 +133,61 @@ def register(
     components: Sequence[Component] = (),
     implant_to_world: Tensor | None = None,
     holes: Sequence[Hole] = (),
+    deformation: DeformationFactory = free_form,
+    intensity: IntensityModel | None = None,
+    similarity: SimilarityFactory | None = None,
+    penalties: Sequence[Penalty] = (),
+    optimizer: OptimizerFactory | None = None,
+    steps: Mapping[str, Step] | None = None,
+    start: RegistrationResult | None = None,
     callbacks: Sequence[Callback] = (),
+    seconds: float | None = None,
 ) -> RegistrationResult:
     """The deformation of an implant, measured in a few projections (FFD-KC-Reg, Cao et al. 2020).
 
     Args:
-        implant: Undeformed implant in its own frame.
+        implants: Undeformed implant in its own frame; or several, each with what is fixed to it.
         data: Projections, masks and geometry.
         config: Options; the defaults when None.
         spectrum: Detected spectrum; a 90 kV tungsten spectrum when None.
-        components: Screws and the like, in the implant's frame; each follows the implant near its head.
-        implant_to_world: Approximate pose (4, 4); the identity when None.
-        holes: The implant's holes, see :func:`torchkcreg.implant.find_holes`: where no components are given, screws are
-            looked for in them.
+        components: Of the one implant, see :class:`Implant`.
+        implant_to_world: Approximate pose (4, 4) of the one implant; the identity when None.
+        holes: Of the one implant.
+        deformation: Makes the deformation of an implant: the free-form deformation of the options, or your own model.
+        intensity: Model in place of the one that the options describe, see :func:`build_scene`.
+        similarity: Makes the data term of ``(fixed, mask, weights)``, in place of the stages' own.
+        penalties: Functions of the K candidates of a :class:`torchkcreg.scene.State` to (K,), beside the priors.
+        optimizer: Makes the optimiser of ``(problem, stage, seed)``, in place of the stages' own.
+        steps: Steps of your own, by the names that stages call them by.
+        start: A registration of the same implants from whose poses and parameters this one starts.
         callbacks: See :class:`torchkcreg.registration.Callback`.
+        seconds: After so long it ends with the iteration it is at; the result says so.
+
+    Raises:
+        ValueError: If the pieces do not fit together.
     """
     config = config or RegistrationConfig()
     scene = build_scene(
-        implant,
+        implants,
         config,
         spectrum=spectrum,
         components=components,
         implant_to_world=implant_to_world,
         holes=holes,
+        deformation=deformation,
+        intensity=intensity,
     )
-    return Trainer(scene, data, config, callbacks=callbacks).fit()
+    if start is not None:
+        _start_from(scene, start)
+    terms = Terms(similarity, tuple(penalties), optimizer)
+    return Trainer(scene, data, config, callbacks=callbacks, terms=terms, steps=steps, seconds=seconds).fit()
+
+
+@torch.no_grad()
+def _start_from(scene: Scene, start: RegistrationResult) -> None:
+    """Poses and parameters of the intensity model of an earlier result; the implants start undeformed."""
+    for assembly in scene:
+        assembly.implant_to_world.copy_(start.implant(assembly.name).implant_to_world)
+    for name, value in scene.intensity.named_parameters():
+        if name in start.intensity:
+            value.fill_(start.intensity[name])

@@ -8,14 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchkcreg.implant import Hole
+from torchkcreg.implant import Hole, Screw
+from torchkcreg.scene import Assembly, RegistrationData, Scene, screw_path
 from torchkcreg.similarity import GradientCorrelation
-
-from .config import RegistrationConfig, Stage
-from .data import RegistrationData
-from .found_screw import FoundScrew
-from .model import StageModel
-from .scene import Scene
 
 _FIRST_LENGTH_MM = 25.0  # a screw that is there is at least about as long, or it holds nothing
 _FIRST_RADIUS = 0.8  # of the hole's
@@ -27,12 +22,12 @@ _LEAST_SHARE = 0.01  # of the loss without screws that one more must take away
 
 
 @torch.no_grad()
-def find_screws(scene: Scene, data: RegistrationData, config: RegistrationConfig, *, bin: int = 4) -> list[FoundScrew]:
+def find_screws(scene: Scene, assembly: Assembly, data: RegistrationData, *, bin: int = 4) -> list[Screw]:
     """Screws of the metal that explains the images best, see :func:`screws_by_metal`."""
-    return of_best_metal(screws_by_metal(scene, data, config, bin=bin))
+    return of_best_metal(screws_by_metal(scene, assembly, data, bin=bin))
 
 
-def of_best_metal(found: Sequence[tuple[list[FoundScrew], float]]) -> list[FoundScrew]:
+def of_best_metal(found: Sequence[tuple[list[Screw], float]]) -> list[Screw]:
     """The screws of least loss; the first ones, of the implant's own metal, have an advantage."""
     losses = [loss * (1.0 if number else _OTHER_METAL) for number, (_, loss) in enumerate(found)]
     return found[losses.index(min(losses))][0]
@@ -40,8 +35,8 @@ def of_best_metal(found: Sequence[tuple[list[FoundScrew], float]]) -> list[Found
 
 @torch.no_grad()
 def screws_by_metal(
-    scene: Scene, data: RegistrationData, config: RegistrationConfig, *, bin: int = 4
-) -> list[tuple[list[FoundScrew], float]]:
+    scene: Scene, assembly: Assembly, data: RegistrationData, *, bin: int = 4
+) -> list[tuple[list[Screw], float]]:
     """Screws in some of an implant's holes, and the loss with them, for each metal; the implant's own comes first.
 
     Starting from none, the hole and side whose screw raises gradient correlation most gets one, until the next would
@@ -50,31 +45,33 @@ def screws_by_metal(
     screws are sold as a set, and those of another metal pull the implant along.
 
     Args:
-        scene: Implant near its pose, with its holes and the screws found so far; other components are ignored.
+        scene: Implants near their poses.
+        assembly: The one of them in whose holes screws are looked for, with those found so far; other components of it
+            are ignored.
         data: Projections.
-        config: Backend.
         bin: Detector pixels are averaged in squares of this side.
     """
-    search = _Search(scene, data, config, bin)
-    found = [search.found_of(metal) for metal in dict.fromkeys([scene.material, *scene.metals])]
+    search = _Search(scene, assembly, data, bin)
+    found = [search.found_of(metal) for metal in dict.fromkeys([assembly.material, *scene.metals])]
     return [(screws, search.loss(screws)) for screws in found]
 
 
 class _Search:
     """Losses of an implant with screws, whose path lengths are rendered once each."""
 
-    def __init__(self, scene: Scene, data: RegistrationData, config: RegistrationConfig, bin: int) -> None:
-        self.scene, self.config = scene.without_components(), config
-        stage = Stage(groups=scene.num_groups, bin=bin, pitch_factor=2, margin_mm=None)
-        self.model = StageModel(self.scene, data, stage, config)
-        self.similarity = GradientCorrelation(self.model.data.line_integrals, self.model.data.mask)
-        self.bare = self.model.path_lengths(self.model.at_rest)
-        self.options = self.model.intensity_options(self.model.at_rest)
-        self.rendered: dict[FoundScrew, Tensor] = {}
-        sides = [(hole, side) for hole in scene.holes for side in (-1.0, 1.0)]
-        self.places = [*scene.found, *(_along(hole, side, scene.material) for hole, side in sides)]
+    def __init__(self, scene: Scene, assembly: Assembly, data: RegistrationData, bin: int) -> None:
+        self.scene, self.assembly = scene, assembly
+        sides = [(hole, side) for hole in assembly.holes for side in (-1.0, 1.0)]
+        self.places = [*assembly.found, *(_along(hole, side, assembly.material) for hole, side in sides)]
+        bare = scene.without_components(assembly)
+        self.view = bare.view(data, bin=bin, pitch_factor=2)
+        state = bare.state(self.view)
+        self.bare = bare.path_lengths(self.view, state)
+        self.physics = bare.arguments(self.view, state)
+        self.similarity = GradientCorrelation(self.view.images.line_integrals, self.view.images.mask)
+        self.rendered: dict[Screw, Tensor] = {}
 
-    def found_of(self, metal: str) -> list[FoundScrew]:
+    def found_of(self, metal: str) -> list[Screw]:
         screws = self.grow([replace(place, material=metal) for place in self.places])
         for index, screw in enumerate(screws):
             screws = self.best_of(screws, index, [screw, *(screw.with_length(length) for length in _LENGTHS_MM)])
@@ -88,29 +85,29 @@ class _Search:
                 screws = self.best_of(screws, index, [screw.with_length(length) for length in lengths])
         return screws
 
-    def loss(self, screws: Sequence[FoundScrew]) -> float:
+    def loss(self, screws: Sequence[Screw]) -> float:
         paths = self.bare.clone()
         for screw in screws:
             paths[:, self.scene.materials.index(screw.material)] += self._path(screw)
-        lines = self.scene.intensity(paths, pooling=self.model.stage.oversampling, **self.options)
+        lines = self.scene.intensity(paths, pooling=self.view.oversampling, **self.physics)
         return 1.0 - float(self.similarity(lines).mean())
 
-    def moved(self, screws: list[FoundScrew], index: int) -> list[FoundScrew]:
+    def moved(self, screws: list[Screw], index: int) -> list[Screw]:
         """A screw where it is and with its head in the other parts of a combination hole, tip and direction kept."""
         screw = screws[index]
         others = [*screws[:index], *screws[index + 1 :]]
         near = [place for place in self.places if place.overlaps(screw) and place.same_side(screw)]
-        variants = [v for place in near for v in (replace(screw, start=place.start), screw.shifted_to(place.start))]
+        variants = [v for place in near for v in (replace(screw, start=place.start), _shifted(screw, place.start))]
         return [screw, *(v for v in variants if not any(v.overlaps(other) for other in others))]
 
-    def grow(self, candidates: list[FoundScrew]) -> list[FoundScrew]:
-        chosen: list[FoundScrew] = []
+    def grow(self, candidates: list[Screw]) -> list[Screw]:
+        chosen: list[Screw] = []
         without = best = self.loss([])
         gains = {candidate: torch.inf for candidate in candidates}
         while gains:
             # What a screw gains hardly grows with the others: as long as the one that gained most before still does,
             # the rest need not be tried again.
-            tried: dict[FoundScrew, float] = {}
+            tried: dict[Screw, float] = {}
             while (top := max(gains, key=gains.__getitem__)) not in tried:
                 tried[top] = gains[top] = best - self.loss([*chosen, top])
             if gains[top] < _LEAST_SHARE * without:
@@ -119,22 +116,28 @@ class _Search:
             gains = {c: gain for c, gain in gains.items() if not c.overlaps(top)}
         return chosen
 
-    def best_of(self, screws: list[FoundScrew], index: int, variants: list[FoundScrew]) -> list[FoundScrew]:
+    def best_of(self, screws: list[Screw], index: int, variants: list[Screw]) -> list[Screw]:
         return min([[*screws[:index], variant, *screws[index + 1 :]] for variant in variants], key=self.loss)
 
-    def best_radius(self, screws: list[FoundScrew], step: float) -> list[FoundScrew]:
+    def best_radius(self, screws: list[Screw], step: float) -> list[Screw]:
         trials = [[s.with_radius(s.radius * (1 + change)) for s in screws] for change in (-step, 0.0, step)]
         return min(trials, key=self.loss)
 
-    def _path(self, screw: FoundScrew) -> Tensor:
-        shape = replace(screw, material=self.scene.material)
+    def _path(self, screw: Screw) -> Tensor:
+        shape = replace(screw, material="", name="")
         if shape not in self.rendered:
-            self.rendered[shape] = self.model.screw_path(shape)
+            self.rendered[shape] = screw_path(self.assembly, self.view, shape)
         return self.rendered[shape]
 
 
-def _along(hole: Hole, side: float, material: str) -> FoundScrew:
+def _along(hole: Hole, side: float, material: str) -> Screw:
     """A first guess of a screw along a hole, its tip on one of the hole's two sides."""
     axis = side * hole.axis
     start, end = hole.center - hole.depth / 2 * axis, hole.center + _FIRST_LENGTH_MM * axis
-    return FoundScrew(tuple(start.tolist()), tuple(end.tolist()), _FIRST_RADIUS * hole.radius, material)
+    return Screw(tuple(start.tolist()), tuple(end.tolist()), _FIRST_RADIUS * hole.radius, material)
+
+
+def _shifted(screw: Screw, start: tuple[float, float, float]) -> Screw:
+    """The screw, moved as a whole until it starts there."""
+    still = torch.zeros(3, dtype=torch.float64)
+    return screw.moved(still, torch.tensor(start, dtype=torch.float64) - torch.tensor(screw.start, dtype=torch.float64))

@@ -7,6 +7,7 @@ from torchkcreg.similarity.gradient_correlation import (
     gradient_correlation,
 )
 from torchkcreg.similarity.gradient_difference import GradientDifference
+from torchkcreg.similarity.model import Similarity
 from torchkcreg.similarity.ncc import normalized_cross_correlation
 from torchkcreg.similarity.sobel import erode_mask, sobel_gradient
 
@@ -14,6 +15,7 @@ __all__ = [
     "GradientCorrelation",
     "GradientCorrelationLoss",
     "GradientDifference",
+    "Similarity",
     "erode_mask",
     "gradient_correlation",
     "normalized_cross_correlation",

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchkcreg.precision import full_precision
+from torchkcreg.similarity.model import Similarity
 from torchkcreg.similarity.ncc import largest_value, unit_contrast
 from torchkcreg.similarity.sobel import erode_mask, sobel_gradient
 
@@ -50,7 +51,7 @@ def gradient_correlation(moving: Tensor, fixed: Tensor, *, mask: Tensor | None =
     return in_blocks(lambda block: _correlate(block, unit_fixed, mask, eroded), moving, whole=fixed.ndim > 3)
 
 
-class OfGradients(nn.Module):
+class OfGradients(Similarity):
     """What similarities of gradients know of the measured images: which pixels count, and the gradients there.
 
     Args:

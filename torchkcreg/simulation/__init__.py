@@ -13,7 +13,6 @@ from torchkcreg.simulation.hardware import (
     hole_positions,
     locking_plate,
     locking_screws,
-    screw_mesh,
 )
 from torchkcreg.simulation.loads import Load, RodMotion
 from torchkcreg.simulation.parts import Part, material_paths
@@ -42,7 +41,6 @@ __all__ = [
     "locking_screws",
     "material_paths",
     "random_case",
-    "screw_mesh",
     "simulate_projections",
     "weight_bearing_case",
 ]

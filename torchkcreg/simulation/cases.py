@@ -11,8 +11,9 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid
+from torchkcreg.implant import Screw
 from torchkcreg.physics import Spectrum, tungsten_spectrum
-from torchkcreg.simulation.hardware import Screw, hole_positions, locking_plate, locking_screws
+from torchkcreg.simulation.hardware import hole_positions, locking_plate, locking_screws
 from torchkcreg.simulation.loads import Load
 from torchkcreg.simulation.parts import Part
 from torchkcreg.simulation.scanner import DetectorModel, simulate_projections
@@ -35,7 +36,7 @@ class SimulatedCase:
         geometry: The views.
         implant: Mesh of the undeformed plate.
         implant_material: Its material.
-        screws: Its screws, undeformed, as `locking_screws` lists them.
+        screws: Its screws, undeformed.
         beads_before: Centres (8, 3) of the steel beads without load, mm.
         beads_after: Where the load takes them: the truth.
         deform: Maps points (..., 3) of the undeformed frame, nodes or beads, to where the load takes them.
@@ -167,11 +168,11 @@ def _parts_in_beam(
     tissue = None if tissue_radius_mm is None else "tissue"
     parts = [Part("plate", _mapped(plate, deform), "steel", inside=tissue)]
     for number, screw in enumerate(screws):
-        head, tip = deform(torch.tensor([screw["from"], screw["to"]], dtype=torch.float64))
-        cylinder = Cylinder(head, tip, screw["radius"])
-        parts.append(Part(f"screw{number}", cylinder, screw["material"], (screw["fragment"],), tissue))
+        head, tip = deform(torch.tensor([screw.start, screw.end], dtype=torch.float64))
+        cylinder = Cylinder(head, tip, screw.radius)
+        parts.append(Part(f"screw{number}", cylinder, screw.material, (fragment_at(screw.start[2]),), tissue))
     for fragment, side in zip(FRAGMENTS, (-1.0, 1.0)):
-        held = [[screw["from"], screw["to"]] for screw in screws if screw["fragment"] == fragment]
+        held = [[screw.start, screw.end] for screw in screws if fragment_at(screw.start[2]) == fragment]
         points = torch.tensor(held, dtype=torch.float64).reshape(-1, 3)
         near, far = _bone_axis(side * GAP / 2, side * 150.0)
         bone = Tube(near, far, outer_radius=13.0, inner_radius=8.0).moved(fit_rigid(points, deform(points)))
@@ -182,6 +183,11 @@ def _parts_in_beam(
         near, far = _bone_axis(-160.0, 160.0)
         parts.append(Part("tissue", Cylinder(near, far, tissue_radius_mm), "soft_tissue"))
     return parts
+
+
+def fragment_at(height: float) -> str:
+    """The fragment of the bone at a height z in mm: distal below the gap, proximal above."""
+    return FRAGMENTS[0] if height < 0 else FRAGMENTS[1]
 
 
 def _bone_axis(*heights: float) -> Tensor:

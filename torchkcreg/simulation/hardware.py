@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TypedDict
 
 import numpy as np
 import torch
 import trimesh
 
+from torchkcreg.implant import Screw
 from torchkcreg.simulation.loads import RodMotion
 from torchkcreg.simulation.outline import plate_outline
-
-Screw = TypedDict("Screw", {"from": list[float], "to": list[float], "radius": float, "material": str, "fragment": str})
-"""A screw as `screws.json` lists them: a cylinder from head to tip, mm, and the fragment that holds it."""
 
 
 def locking_plate(
@@ -112,29 +109,15 @@ def locking_screws(
     radius: float = 2.0,
     material: str = "steel",
 ) -> list[Screw]:
-    """Screws through a plate at heights z in mm, in its frame, each a dict as `screws.json` lists them.
+    """Screws through a plate at heights z in mm, in its frame.
 
-    The bone's fragment that holds a screw is the `distal` one below z = 0 and the `proximal` one above.
-
-    >>> locking_screws([-63.0])[0]["fragment"]
-    'distal'
+    >>> locking_screws([-63.0])[0].length
+    36.3
     """
     return [
-        {
-            "from": [0.0, float(head_y), float(z)],
-            "to": [0.0, float(tip_y), float(z)],
-            "radius": float(radius),
-            "material": material,
-            "fragment": "distal" if z < 0 else "proximal",
-        }
-        for z in positions
+        Screw((0.0, head_y, float(z)), (0.0, tip_y, float(z)), radius, material, f"screw{number}")
+        for number, z in enumerate(positions)
     ]
-
-
-def screw_mesh(screw: Screw, *, sections: int = 32) -> trimesh.Trimesh:
-    """Watertight mesh of a screw, a cylinder from its head to its tip."""
-    segment = np.array([screw["from"], screw["to"]], dtype=float)
-    return trimesh.creation.cylinder(radius=screw["radius"], segment=segment, sections=sections)
 
 
 def bone_fragments(

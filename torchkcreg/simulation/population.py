@@ -13,10 +13,11 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid, rigid_matrix
+from torchkcreg.implant import Screw
 from torchkcreg.physics import tungsten_spectrum
-from torchkcreg.simulation.cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase
+from torchkcreg.simulation.cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase, fragment_at
 from torchkcreg.simulation.draws import Draw, draw_case
-from torchkcreg.simulation.hardware import Screw, locking_plate
+from torchkcreg.simulation.hardware import locking_plate
 from torchkcreg.simulation.loads import Load, RodMotion
 from torchkcreg.simulation.parts import Part
 from torchkcreg.simulation.scanner import simulate_projections
@@ -155,13 +156,10 @@ def _screws(draw: Draw, rest: RodMotion, loaded: RodMotion) -> tuple[list[Screw]
         head = torch.tensor([0.0, top, offset], dtype=torch.float64)
         tip = head + length * axis / axis.norm()
         ends = torch.stack([head, tip])
-        fragment = FRAGMENTS[0] if height < 0 else FRAGMENTS[1]
+        fragment = fragment_at(height)
         before, after = (motion.frames(z)[0] for motion in (rest, loaded))
         start, end = ends @ before[:3, :3].T + before[:3, 3]
-        listed.append(
-            {"from": start.tolist(), "to": end.tolist(), "radius": radius, "material": draw.screw_material}
-            | {"fragment": fragment}  # type: ignore[arg-type]
-        )
+        listed.append(Screw(tuple(start.tolist()), tuple(end.tolist()), radius, draw.screw_material, f"screw{number}"))
         shaft = ends @ after[:3, :3].T + after[:3, 3]
         parts.append(
             Part(f"screw{number}", Cylinder(shaft[0], shaft[1], radius), draw.screw_material, (fragment,), tissue)

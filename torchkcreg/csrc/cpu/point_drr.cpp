@@ -2,7 +2,7 @@
 //
 // Sums in a fixed order whatever the number of threads: forward, every chunk of nodes draws a tile of its own, and
 // tiles are added to an image in the order of chunks, each row by one thread. Backward, a chunk's gradients belong to
-// one task, which takes views and (where masses share a gradient) candidates in order.
+// one task, which takes views and (where volumes share a gradient) candidates in order.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
@@ -67,7 +67,7 @@ void draw_images(const Problem& p, const Inputs<scalar_t>& in, scalar_t* images)
 
 template <typename scalar_t>
 struct Gradients {
-  scalar_t *points, *masses, *matrices;  // zeros; the latter two may be null
+  scalar_t *points, *volumes, *matrices;  // zeros; the latter two may be null
 };
 
 template <typename scalar_t>
@@ -78,13 +78,13 @@ void gather_gradients(const Problem& p, const Inputs<scalar_t>& in, const scalar
   const auto gather_chunk = [&](int64_t b, int64_t c, ChunkView<scalar_t>& scratch, Tile<scalar_t>& tile) {
     for (int64_t v = 0; v < p.views; ++v) {
       const ChunkGradients<scalar_t> to{out.points + (b * p.nodes + p.chunk_begin(c)) * 3,
-                                        out.masses ? out.masses + p.chunk_begin(c) : nullptr,
+                                        out.volumes ? out.volumes + p.chunk_begin(c) : nullptr,
                                         out.matrices ? shares.data() + ((b * chunks + c) * p.views + v) * 12 : nullptr};
       gather(p, in, grad, b, v, c, scratch, tile, to);
     }
   };
-  // Candidates share the masses, so then a task takes a chunk through all of them.
-  const int64_t outer = out.masses ? 1 : p.candidates, inner = out.masses ? p.candidates : 1;
+  // Candidates share the volumes, so then a task takes a chunk through all of them.
+  const int64_t outer = out.volumes ? 1 : p.candidates, inner = out.volumes ? p.candidates : 1;
   torch::stable::parallel_for(0, outer * chunks, 1, [&](int64_t begin, int64_t stop) {
     const auto scratch = std::make_unique<ChunkView<scalar_t>>();
     Tile<scalar_t> tile;
@@ -98,10 +98,10 @@ void gather_gradients(const Problem& p, const Inputs<scalar_t>& in, const scalar
   for (size_t k = 0; k < sums.size(); ++k) out.matrices[k] = static_cast<scalar_t>(sums[k]);
 }
 
-Problem check(const Tensor& points, const Tensor& masses, const Tensor& matrices, const Tensor& table,
+Problem check(const Tensor& points, const Tensor& volumes, const Tensor& matrices, const Tensor& table,
               int64_t block_size, int64_t rows, int64_t cols) {
   STD_TORCH_CHECK(points.dim() == 3 && points.size(2) == 3, "points must have shape (B, N, 3)");
-  STD_TORCH_CHECK(masses.dim() == 1 && masses.size(0) == points.size(1), "masses must have shape (N,)");
+  STD_TORCH_CHECK(volumes.dim() == 1 && volumes.size(0) == points.size(1), "volumes must have shape (N,)");
   STD_TORCH_CHECK(matrices.dim() == 3 && matrices.size(1) == 3 && matrices.size(2) == 4,
                   "matrices must have shape (V, 3, 4)");
   STD_TORCH_CHECK(table.dim() == 6 && table.size(2) == table.size(3) && table.size(4) == table.size(5),
@@ -116,7 +116,7 @@ Problem check(const Tensor& points, const Tensor& masses, const Tensor& matrices
                   "table must have one entry for each view and block");
   const ScalarType dtype = points.scalar_type();
   STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, "points must be float32 or float64");
-  for (const Tensor* t : {&points, &masses, &matrices, &table}) {
+  for (const Tensor* t : {&points, &volumes, &matrices, &table}) {
     STD_TORCH_CHECK(t->is_cpu() && t->scalar_type() == dtype, "tensors must be on the CPU and of one dtype");
   }
   return Problem{points.size(0), points.size(1), matrices.size(0), rows,
@@ -124,54 +124,54 @@ Problem check(const Tensor& points, const Tensor& masses, const Tensor& matrices
 }
 
 template <typename scalar_t>
-Inputs<scalar_t> pointers(const Tensor& points, const Tensor& masses, const Tensor& matrices, const Tensor& table) {
-  return {points.const_data_ptr<scalar_t>(), masses.const_data_ptr<scalar_t>(), matrices.const_data_ptr<scalar_t>(),
+Inputs<scalar_t> pointers(const Tensor& points, const Tensor& volumes, const Tensor& matrices, const Tensor& table) {
+  return {points.const_data_ptr<scalar_t>(), volumes.const_data_ptr<scalar_t>(), matrices.const_data_ptr<scalar_t>(),
           table.const_data_ptr<scalar_t>()};
 }
 
-Tensor point_drr(const Tensor& points_, const Tensor& masses_, const Tensor& matrices_, const Tensor& table_,
+Tensor point_drr(const Tensor& points_, const Tensor& volumes_, const Tensor& matrices_, const Tensor& table_,
                  int64_t block_size, int64_t rows, int64_t cols) {
-  const Problem p = check(points_, masses_, matrices_, table_, block_size, rows, cols);
-  const Tensor points = torch::stable::contiguous(points_), masses = torch::stable::contiguous(masses_);
+  const Problem p = check(points_, volumes_, matrices_, table_, block_size, rows, cols);
+  const Tensor points = torch::stable::contiguous(points_), volumes = torch::stable::contiguous(volumes_);
   const Tensor matrices = torch::stable::contiguous(matrices_), table = torch::stable::contiguous(table_);
   Tensor images = torch::stable::new_zeros(points, {p.candidates, p.views, rows, cols});
   if (points.scalar_type() == ScalarType::Float) {
-    draw_images(p, pointers<float>(points, masses, matrices, table), images.mutable_data_ptr<float>());
+    draw_images(p, pointers<float>(points, volumes, matrices, table), images.mutable_data_ptr<float>());
   } else {
-    draw_images(p, pointers<double>(points, masses, matrices, table), images.mutable_data_ptr<double>());
+    draw_images(p, pointers<double>(points, volumes, matrices, table), images.mutable_data_ptr<double>());
   }
   return images;
 }
 
 template <typename scalar_t>
-Gradients<scalar_t> gradient_pointers(const Tensor& points, const Tensor& masses, const Tensor& matrices) {
-  return {points.mutable_data_ptr<scalar_t>(), masses.numel() ? masses.mutable_data_ptr<scalar_t>() : nullptr,
+Gradients<scalar_t> gradient_pointers(const Tensor& points, const Tensor& volumes, const Tensor& matrices) {
+  return {points.mutable_data_ptr<scalar_t>(), volumes.numel() ? volumes.mutable_data_ptr<scalar_t>() : nullptr,
           matrices.numel() ? matrices.mutable_data_ptr<scalar_t>() : nullptr};
 }
 
-std::tuple<Tensor, Tensor, Tensor> point_drr_backward(const Tensor& grad_, const Tensor& points_, const Tensor& masses_,
+std::tuple<Tensor, Tensor, Tensor> point_drr_backward(const Tensor& grad_, const Tensor& points_, const Tensor& volumes_,
                                                       const Tensor& matrices_, const Tensor& table_, int64_t block_size,
-                                                      bool need_masses, bool need_matrices) {
+                                                      bool need_volumes, bool need_matrices) {
   STD_TORCH_CHECK(grad_.dim() == 4, "grad must have shape (B, V, rows, cols)");
-  const Problem p = check(points_, masses_, matrices_, table_, block_size, grad_.size(2), grad_.size(3));
+  const Problem p = check(points_, volumes_, matrices_, table_, block_size, grad_.size(2), grad_.size(3));
   STD_TORCH_CHECK(grad_.size(0) == p.candidates && grad_.size(1) == p.views && grad_.is_cpu() &&
                       grad_.scalar_type() == points_.scalar_type(),
                   "grad must fit the images");
-  const Tensor points = torch::stable::contiguous(points_), masses = torch::stable::contiguous(masses_);
+  const Tensor points = torch::stable::contiguous(points_), volumes = torch::stable::contiguous(volumes_);
   const Tensor matrices = torch::stable::contiguous(matrices_), table = torch::stable::contiguous(table_);
   const Tensor grad = torch::stable::contiguous(grad_);
   Tensor to_points = torch::stable::new_zeros(points, {p.candidates, p.nodes, 3});
-  Tensor to_masses = torch::stable::new_zeros(points, {need_masses ? p.nodes : 0});
+  Tensor to_volumes = torch::stable::new_zeros(points, {need_volumes ? p.nodes : 0});
   Tensor to_matrices =
       need_matrices ? torch::stable::new_zeros(points, {p.views, 3, 4}) : torch::stable::new_zeros(points, {0});
   if (points.scalar_type() == ScalarType::Float) {
-    gather_gradients(p, pointers<float>(points, masses, matrices, table), grad.const_data_ptr<float>(),
-                     gradient_pointers<float>(to_points, to_masses, to_matrices));
+    gather_gradients(p, pointers<float>(points, volumes, matrices, table), grad.const_data_ptr<float>(),
+                     gradient_pointers<float>(to_points, to_volumes, to_matrices));
   } else {
-    gather_gradients(p, pointers<double>(points, masses, matrices, table), grad.const_data_ptr<double>(),
-                     gradient_pointers<double>(to_points, to_masses, to_matrices));
+    gather_gradients(p, pointers<double>(points, volumes, matrices, table), grad.const_data_ptr<double>(),
+                     gradient_pointers<double>(to_points, to_volumes, to_matrices));
   }
-  return {to_points, to_masses, to_matrices};
+  return {to_points, to_volumes, to_matrices};
 }
 
 }  // namespace

@@ -28,11 +28,11 @@ struct BatchWeights {
 };
 
 template <typename scalar_t>
-TORCHKCREG_INLINE void weigh_corners(const ChunkView<scalar_t>& chunk, const scalar_t* TORCHKCREG_RESTRICT masses,
+TORCHKCREG_INLINE void weigh_corners(const ChunkView<scalar_t>& chunk, const scalar_t* TORCHKCREG_RESTRICT volumes,
                                      int64_t first, int64_t count, int32_t cols, BatchWeights<scalar_t>& batch) {
   for (int64_t k = 0; k < count; ++k) {
     const int64_t i = first + k;
-    const scalar_t amplitude = masses[chunk.node[i]] * chunk.inverse_depth[i] * chunk.inverse_depth[i];
+    const scalar_t amplitude = volumes[chunk.node[i]] * chunk.inverse_depth[i] * chunk.inverse_depth[i];
     const scalar_t right = chunk.fraction_u[i], down = chunk.fraction_v[i];
     const scalar_t lower = amplitude * down, upper = amplitude - lower;
     batch.weights[4 * k] = upper - upper * right;
@@ -47,7 +47,7 @@ TORCHKCREG_INLINE void weigh_corners(const ChunkView<scalar_t>& chunk, const sca
 template <typename scalar_t, int T>
 TORCHKCREG_INLINE void spread_nodes(ChunkView<scalar_t>& chunk, const TableShape& shape,
                                     const scalar_t* TORCHKCREG_RESTRICT table,
-                                    const scalar_t* TORCHKCREG_RESTRICT masses, scalar_t* TORCHKCREG_RESTRICT tile) {
+                                    const scalar_t* TORCHKCREG_RESTRICT volumes, scalar_t* TORCHKCREG_RESTRICT tile) {
   const int32_t stride = static_cast<int32_t>(chunk.patch.cols());
   const Taps<scalar_t, T> taps{shape.taps, shape.phases + 1, stride};
   const int64_t area = shape.taps * shape.taps;
@@ -59,7 +59,7 @@ TORCHKCREG_INLINE void spread_nodes(ChunkView<scalar_t>& chunk, const TableShape
       scalar_t* cells = aligned_zeros(rows * cols * T * T, chunk.cells);
       for (int64_t first = 0; first < chunk.count; first += kBatch) {
         const int64_t count = std::min(kBatch, chunk.count - first);
-        weigh_corners(chunk, masses, first, count, static_cast<int32_t>(cols), batch);
+        weigh_corners(chunk, volumes, first, count, static_cast<int32_t>(cols), batch);
         for (int64_t k = 0; k < count; ++k) {
           taps.add_to_cell(table + chunk.phase[first + k] * area, batch.weights + 4 * k,
                            cells + batch.offsets[k] * (T * T));
@@ -71,7 +71,7 @@ TORCHKCREG_INLINE void spread_nodes(ChunkView<scalar_t>& chunk, const TableShape
   }
   for (int64_t first = 0; first < chunk.count; first += kBatch) {
     const int64_t count = std::min(kBatch, chunk.count - first);
-    weigh_corners(chunk, masses, first, count, stride, batch);
+    weigh_corners(chunk, volumes, first, count, stride, batch);
     for (int64_t k = 0; k < count; ++k) {
       taps.add(table + chunk.phase[first + k] * area, batch.weights + 4 * k, tile + batch.offsets[k]);
     }
@@ -81,34 +81,34 @@ TORCHKCREG_INLINE void spread_nodes(ChunkView<scalar_t>& chunk, const TableShape
 template <typename scalar_t>
 struct ChunkGradients {
   scalar_t* points;  // (count, 3), added to
-  scalar_t* masses;  // (count,), added to; may be null
+  scalar_t* volumes;  // (count,), added to; may be null
   double* matrix;    // (3, 4), added to; may be null
 };
 
-// What the image's gradient says of a batch of nodes: of (U, V, W) = P (x, y, z, 1), and of the mass.
+// What the image's gradient says of a batch of nodes: of (U, V, W) = P (x, y, z, 1), and of the volume.
 template <typename scalar_t>
 struct BatchGradients {
-  alignas(64) scalar_t u[kBatch], v[kBatch], w[kBatch], mass[kBatch];
+  alignas(64) scalar_t u[kBatch], v[kBatch], w[kBatch], volume[kBatch];
 };
 
 template <typename scalar_t>
 TORCHKCREG_INLINE void chain_rule(const ChunkView<scalar_t>& chunk, scalar_t phases, int64_t first, int64_t batch,
-                                  const scalar_t* TORCHKCREG_RESTRICT masses, const scalar_t* TORCHKCREG_RESTRICT dots,
+                                  const scalar_t* TORCHKCREG_RESTRICT volumes, const scalar_t* TORCHKCREG_RESTRICT dots,
                                   BatchGradients<scalar_t>& out) {
   for (int64_t k = 0; k < batch; ++k) {
     const int64_t i = first + k;
     const scalar_t s = chunk.inverse_depth[i], right = chunk.fraction_u[i], down = chunk.fraction_v[i];
-    const scalar_t amplitude = masses[chunk.node[i]] * s * s;
+    const scalar_t amplitude = volumes[chunk.node[i]] * s * s;
     const scalar_t upper_step = dots[4 * k + 1] - dots[4 * k], lower_step = dots[4 * k + 3] - dots[4 * k + 2];
     const scalar_t upper = dots[4 * k] + right * upper_step, lower = dots[4 * k + 2] + right * lower_step;
     const scalar_t value = upper + down * (lower - upper);
     const scalar_t grad_u = amplitude * phases * (upper_step + down * (lower_step - upper_step));
     const scalar_t grad_v = amplitude * phases * (lower - upper);
-    // u = U / W, v = V / W, amplitude = mass / W^2
+    // u = U / W, v = V / W, amplitude = volume / W^2
     out.u[k] = grad_u * s;
     out.v[k] = grad_v * s;
     out.w[k] = -(grad_u * chunk.u[i] + grad_v * chunk.v[i] + 2 * amplitude * value) * s;
-    out.mass[k] = value * s * s;
+    out.volume[k] = value * s * s;
   }
 }
 
@@ -133,7 +133,7 @@ template <typename scalar_t, int T>
 TORCHKCREG_INLINE void gather_nodes(const ChunkView<scalar_t>& chunk, const TableShape& shape,
                                     const scalar_t* TORCHKCREG_RESTRICT table,
                                     const scalar_t* TORCHKCREG_RESTRICT points,
-                                    const scalar_t* TORCHKCREG_RESTRICT masses, const scalar_t* TORCHKCREG_RESTRICT m,
+                                    const scalar_t* TORCHKCREG_RESTRICT volumes, const scalar_t* TORCHKCREG_RESTRICT m,
                                     const scalar_t* TORCHKCREG_RESTRICT tile, const ChunkGradients<scalar_t>& grad) {
   const int32_t stride = static_cast<int32_t>(chunk.patch.cols());
   const Taps<scalar_t, T> taps{shape.taps, shape.phases + 1, stride};
@@ -148,15 +148,15 @@ TORCHKCREG_INLINE void gather_nodes(const ChunkView<scalar_t>& chunk, const Tabl
     for (int64_t k = 0; k < count; ++k) {
       taps.dot(table + chunk.phase[first + k] * area, tile + patch_offset(chunk, stride, first + k), dots + 4 * k);
     }
-    chain_rule(chunk, static_cast<scalar_t>(shape.phases), first, count, masses, dots, batch);
+    chain_rule(chunk, static_cast<scalar_t>(shape.phases), first, count, volumes, dots, batch);
     for (int64_t k = 0; k < count; ++k) {
       scalar_t* to = grad_points + 3 * node[k];
       to[0] += m0 * batch.u[k] + m4 * batch.v[k] + m8 * batch.w[k];
       to[1] += m1 * batch.u[k] + m5 * batch.v[k] + m9 * batch.w[k];
       to[2] += m2 * batch.u[k] + m6 * batch.v[k] + m10 * batch.w[k];
     }
-    if (grad.masses) {
-      for (int64_t k = 0; k < count; ++k) grad.masses[node[k]] += batch.mass[k];
+    if (grad.volumes) {
+      for (int64_t k = 0; k < count; ++k) grad.volumes[node[k]] += batch.volume[k];
     }
     if (grad.matrix) add_matrix_gradient(batch, count, node, points, grad.matrix);
   }

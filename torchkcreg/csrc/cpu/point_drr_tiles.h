@@ -31,7 +31,7 @@ struct Problem {
 
 template <typename scalar_t>
 struct Inputs {
-  const scalar_t *points, *masses, *matrices, *table;
+  const scalar_t *points, *volumes, *matrices, *table;
 };
 
 template <typename scalar_t>
@@ -56,7 +56,7 @@ TORCHKCREG_INLINE void draw_tile(const Problem& p, const Inputs<scalar_t>& in, i
   locate_nodes(p, in, candidate, view, chunk, scratch);
   tile.patch = scratch.patch;
   tile.pixels.assign(scratch.patch.size(), scalar_t(0));
-  spread_nodes<scalar_t, T>(scratch, p.table, in.table + p.table_offset(view, chunk), in.masses + p.chunk_begin(chunk),
+  spread_nodes<scalar_t, T>(scratch, p.table, in.table + p.table_offset(view, chunk), in.volumes + p.chunk_begin(chunk),
                             tile.pixels.data());
 }
 
@@ -81,7 +81,7 @@ TORCHKCREG_INLINE void gather_tile(const Problem& p, const Inputs<scalar_t>& in,
   copy_patch(p, grad + (candidate * p.views + view) * p.rows * p.cols, tile);
   gather_nodes<scalar_t, T>(scratch, p.table, in.table + p.table_offset(view, chunk),
                             in.points + (candidate * p.nodes + p.chunk_begin(chunk)) * 3,
-                            in.masses + p.chunk_begin(chunk), in.matrices + 12 * view, tile.pixels.data(), out);
+                            in.volumes + p.chunk_begin(chunk), in.matrices + 12 * view, tile.pixels.data(), out);
 }
 
 // target_clones works on plain functions only, hence one of them for every case that is worth code of its own: 4 taps

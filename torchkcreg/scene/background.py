@@ -9,21 +9,18 @@ from torch import Tensor
 
 from torchkcreg.physics import gaussian_blur, scattered_signal
 
-from .config import RegistrationConfig, Stage
-from .data import RegistrationData, resized
-from .following import PIXELS_OF_SIGMA
-from .model import StageModel
+from .data import RegistrationData
+from .following import PIXELS_OF_SIGMA, resized
 from .scene import Scene
 
 _ITERATIONS = 4
 _PROBE_MM = 0.5
+_COARSEST_BIN = 4
 
 
 @torch.no_grad()
-def with_background(
-    scene: Scene, data: RegistrationData, config: RegistrationConfig, smoothness_mm: float | None = None
-) -> RegistrationData:
-    """The data with a path length B of ``config.background_material`` that stands for what is not known.
+def with_background(scene: Scene, data: RegistrationData, smoothness_mm: float) -> RegistrationData:
+    """The data with a path length B of the intensity model's background, which stands for what is not known.
 
     The measured transmission is ``T(B) + s`` with T of the known components behind a background B, and the scatter s.
     Within a Gaussian window of ``smoothness_mm`` a factor of T is fitted by least squares,
@@ -33,35 +30,40 @@ def with_background(
     scatter, which decides how an edge looks.
 
     Args:
-        scene: Implant near its pose, with its intensity model.
+        scene: Implants near their poses, with an intensity model that knows a background.
         data: Projections.
-        config: Background material, backend.
-        smoothness_mm: Standard deviation of the window at the detector; None: ``config.background_mm``.
+        smoothness_mm: Standard deviation of the window at the detector.
+
+    Raises:
+        ValueError: If the intensity model knows no background.
     """
-    width = config.background_mm if smoothness_mm is None else smoothness_mm
-    background = _BackgroundFit(scene, data, config, width)()
-    return replace(data, background=resized(background, data.geometry.det_shape), background_mm=width)
+    if not scene.intensity.has_background:
+        raise ValueError(f"{type(scene.intensity).__name__} knows no background that could be estimated")
+    background = _BackgroundFit(scene, data, smoothness_mm)()
+    return replace(data, background=resized(background, data.geometry.det_shape), background_mm=smoothness_mm)
 
 
 class _BackgroundFit:
     """The background that goes with the parameters of the intensity model."""
 
-    def __init__(self, scene: Scene, data: RegistrationData, config: RegistrationConfig, width_mm: float) -> None:
-        bare = replace(data, background=None)
+    def __init__(self, scene: Scene, data: RegistrationData, width_mm: float) -> None:
         coarse = int(PIXELS_OF_SIGMA * width_mm / data.geometry.pixel_spacing[1])
-        self.stage = Stage(groups=scene.num_groups, bin=min(max(coarse, 1), 4), pitch_factor=2, margin_mm=None)
-        self.model = StageModel(scene, bare, self.stage, config)
+        bare = replace(data, background=None)
+        self.view = scene.view(bare, bin=min(max(coarse, 1), _COARSEST_BIN), pitch_factor=2)
         self.intensity = scene.intensity
-        self.physics = self.model.nuisance(self.model.split(self.model.at_rest).physics)
-        self.paths = self.model.path_lengths(self.model.at_rest)[:, :-1]
-        self.measured = torch.exp(-self.model.data.line_integrals)
-        self.sigma = width_mm / self.model.data.geometry.pixel_spacing[1]
+        state = scene.state(self.view)
+        self.physics = dict(state.physics)
+        self.paths = scene.path_lengths(self.view, state)[:, :-1]
+        self.images = self.view.images
+        self.measured = torch.exp(-self.images.line_integrals)
+        self.sigma = width_mm / self.view.geometry.pixel_spacing[1]
 
     def __call__(self) -> Tensor:
         """Path length B (V, rows, cols), mm."""
-        levels = torch.stack([self.physics["scatter"], self.physics["scatter_removed"]], dim=-1)
-        physics = {**self.physics, "scatter": torch.zeros(1), "scatter_removed": torch.zeros(1)}
-        primary = self.measured - scattered_signal(levels, self.model.data.scatter_shapes)[0]
+        levels = torch.stack([self.physics["scatter"], self.physics["scatter_removed"]], dim=-1).to(self.measured)
+        none = torch.zeros_like(self.physics["scatter"])
+        physics = {**self.physics, "scatter": none, "scatter_removed": none}
+        primary = self.measured - scattered_signal(levels, self.images.scatter_shapes)[0]
         background = torch.zeros_like(primary)
         for _ in range(_ITERATIONS):
             known = self._transmission(background, physics)
@@ -75,7 +77,7 @@ class _BackgroundFit:
     def _transmission(self, background: Tensor, physics: dict[str, Tensor]) -> Tensor:
         unknown = resized(background, (self.paths.shape[-2], self.paths.shape[-1]))
         lengths = torch.cat([self.paths, unknown[None, None]], dim=1)
-        return torch.exp(-self.intensity(lengths, pooling=self.stage.oversampling, **physics))[0]
+        return torch.exp(-self.intensity(lengths, pooling=self.view.oversampling, **physics))[0]
 
     def _window(self, image: Tensor) -> Tensor:
-        return gaussian_blur(image * self.model.data.mask, self.sigma).clamp_min(1e-6)
+        return gaussian_blur(image * self.images.mask, self.sigma).clamp_min(1e-6)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.physics import scatter_shapes
+
+from .following import resized
 
 _SCATTER_BLOCK = 8  # scatter is smooth: its shape is found on blocks of this many pixels squared
 
@@ -22,7 +25,7 @@ class RegistrationData:
 
     Attributes:
         geometry: V views.
-        line_integrals: -ln(I / I0), shape (V, rows, cols).
+        line_integrals: -ln(I / I0), shape (V, rows, cols); in float64 all images of a registration are.
         mask: True where a pixel counts, shape (V, rows, cols); all pixels when None was given.
         background: Path length of what the known components lack (bone, water) through one material that stands for
             it, shape (V, rows, cols), mm; None where nothing is known of it.
@@ -60,12 +63,20 @@ class RegistrationData:
             empty = (~mask.any(dim=-1).any(dim=-1)).nonzero().flatten().tolist()
             raise ValueError(f"no valid pixel is left in view {', '.join(map(str, empty))}")
         object.__setattr__(self, "mask", mask)
-        object.__setattr__(self, "line_integrals", torch.where(mask, self.line_integrals, 0.0).float())
+        lines = torch.where(mask, self.line_integrals, 0.0)
+        if lines.dtype not in (torch.float32, torch.float64):
+            lines = lines.to(torch.float32)
+        object.__setattr__(self, "line_integrals", lines)
 
     @property
     def num_views(self) -> int:
         """Number of views V."""
         return self.line_integrals.shape[0]
+
+    def to(self, device: torch.device | str) -> RegistrationData:
+        """The data on another device."""
+        moved: dict[str, Any] = {n: v.to(device) for n, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, geometry=copy.deepcopy(self.geometry).to(device), **moved)
 
     def facing(self, points: Tensor) -> RegistrationData:
         """The data with these world points (N, 3) in front of every source, see :meth:`ConeBeamGeometry.facing`."""
@@ -89,7 +100,7 @@ class RegistrationData:
         def mean(image: Tensor) -> Tensor:
             return avg_pool2d(image[:, :rows, :cols], factor)
 
-        share = mean(self.mask.float())
+        share = mean(self.mask.to(self.line_integrals))
         transmission = mean(torch.exp(-self.line_integrals) * self.mask) / share.clamp_min(1e-6)
         line_integrals = -torch.log(transmission.clamp_min(1e-6))
         return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5, **self._estimates(mean))
@@ -131,8 +142,9 @@ class RegistrationData:
 
         def continued(image: Tensor) -> Tensor:
             """An estimate goes on beyond the detector, from where the blur of a DRR mixes it in."""
-            v, u = (torch.arange(size) + first for size, first in ((size_v, low[:, 1:]), (size_u, low[:, :1])))
-            views = torch.arange(self.num_views)[:, None, None]
+            sizes = ((size_v, low[:, 1:]), (size_u, low[:, :1]))
+            v, u = (torch.arange(size, device=low.device) + first for size, first in sizes)
+            views = torch.arange(self.num_views, device=low.device)[:, None, None]
             return image[views, v.clamp_max(rows - 1)[:, :, None], u.clamp_max(cols - 1)[:, None, :]]
 
         geometry = ConeBeamGeometry(
@@ -150,7 +162,7 @@ class RegistrationData:
         factor = min(_SCATTER_BLOCK, *self.geometry.det_shape)
         sigma = sigma_mm / self.geometry.pixel_spacing[1] / factor
         transmission = adaptive_avg_pool2d(torch.exp(-self.line_integrals) * self.mask, self._blocks(factor))
-        share = adaptive_avg_pool2d(self.mask.float(), self._blocks(factor))
+        share = adaptive_avg_pool2d(self.mask.to(transmission), self._blocks(factor))
         shapes = scatter_shapes(transmission / share.clamp_min(1e-3), share, sigma)
         return replace(self, scatter_shapes=torch.stack([resized(s, self.geometry.det_shape) for s in shapes]))
 
@@ -163,8 +175,3 @@ class RegistrationData:
         background = None if self.background is None else change(self.background)
         shapes = None if self.scatter_shapes is None else torch.stack([change(s) for s in self.scatter_shapes])
         return {"background": background, "scatter_shapes": shapes, "background_mm": self.background_mm}
-
-
-def resized(images: Tensor, det_shape: tuple[int, int]) -> Tensor:
-    """Smooth images (V, rows, cols) on other pixels of the same detector."""
-    return interpolate(images[None], size=tuple(det_shape), mode="bilinear", align_corners=False)[0]

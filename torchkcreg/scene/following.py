@@ -57,3 +57,8 @@ class FollowingBackground:
         rows, cols = self.mask.shape[-2:]
         size = (images.shape[-2] * self.block, images.shape[-1] * self.block)
         return interpolate(images, size=size, mode="bilinear", align_corners=False)[..., :rows, :cols]
+
+
+def resized(images: Tensor, det_shape: tuple[int, int]) -> Tensor:
+    """Smooth images (V, rows, cols) on other pixels of the same detector."""
+    return interpolate(images[None], size=tuple(det_shape), mode="bilinear", align_corners=False)[0]

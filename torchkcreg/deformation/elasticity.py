@@ -1,0 +1,62 @@
+"""The elastic energy of an implant whose groups of control points move."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchkcreg.deformation.grid import ControlPointGrid
+from torchkcreg.deformation.groups import group_moment_gradients, moment_features
+from torchkcreg.deformation.strain import strain_energy
+from torchkcreg.geometry import transform_points
+
+
+class Elasticity:
+    """Strains and displacements of an implant under motions of groups of control points.
+
+    Motions are given as `motion_coefficients`, (K, 4 G, 3) in the grid's axes.
+
+    Args:
+        grid: Control points.
+        labels: Group of each control point.
+        points: Nodes of the implant, shape (N, 3); bending is smooth, a few thousand give its integral.
+        volumes: Their volumes, shape (N,), mm^3.
+    """
+
+    def __init__(self, grid: ControlPointGrid, labels: Tensor, points: Tensor, volumes: Tensor) -> None:
+        points = points.double()
+        self.volumes = volumes.double()
+        self.moments = moment_features(grid, labels, points)
+        self.slopes = group_moment_gradients(grid, labels, points).flatten(-2)
+        self.grid, self.labels, self.points = grid, labels, points
+        self.share = (self.volumes / self.volumes.sum()).sqrt()
+
+    def of_filling(self) -> Elasticity:
+        """The same for a solid that fills the grid's valid domain, one node a cell."""
+        cells = self.grid.positions()[1:-2, 1:-2, 1:-2].reshape(-1, 3)
+        spacing = torch.tensor(self.grid.spacing, dtype=torch.float64)
+        middles = transform_points(self.grid.frame, cells + spacing / 2)
+        return Elasticity(self.grid, self.labels, middles, spacing.prod().expand(len(middles)))
+
+    @property
+    def volume(self) -> float:
+        """Of the implant, mm^3."""
+        return float(self.volumes.sum())
+
+    def gradients(self, steps: Tensor) -> Tensor:
+        """Deformation gradients (K, N, 3, 3)."""
+        return torch.eye(3).to(steps) + (self.slopes @ steps[:, None]).mT
+
+    def energy(self, steps: Tensor) -> Tensor:
+        """Mean energy density over Young's modulus, shape (K,); half a squared strain."""
+        return strain_energy(self.gradients(steps), self.volumes)
+
+    def strains(self, steps: Tensor) -> Tensor:
+        """Green-Lagrange strains, (K, 9 N), so weighted that half their squares sum to the energy."""
+        gradients = self.gradients(steps)
+        strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(steps))
+        return (strain * self.share[:, None, None]).flatten(1)
+
+    def displacements(self, steps: Tensor) -> Tensor:
+        """Displacements, (K, 3 N), so weighted that their squares sum to the mean square, mm^2."""
+        return ((self.moments @ steps) * self.share[:, None]).flatten(1)

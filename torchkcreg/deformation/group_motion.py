@@ -1,0 +1,123 @@
+"""Rigid motions of control-point groups as a vector of millimetres that an optimiser can walk in."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchkcreg.deformation.clustering import carrying, cluster_control_points, control_point_volumes
+from torchkcreg.deformation.elasticity import Elasticity
+from torchkcreg.deformation.groups import (
+    control_points_from_groups,
+    group_centers,
+    moment_features,
+    motion_coefficients,
+)
+from torchkcreg.deformation.model import Motion
+from torchkcreg.deformation.penalty import diffusion_penalty
+from torchkcreg.deformation.prior import BendingPrior
+from torchkcreg.deformation.spline_field import SplineField
+from torchkcreg.geometry import fit_rigid, rotation_from_vector
+from torchkcreg.implant import ImplantPointCloud
+
+_CARRIED_PITCH_MM = 1.0
+_SOLID_PITCH_MM = 2.0  # bending is smooth: its energy needs few nodes
+_LEAST_RADIUS_MM = 5.0
+
+
+class GroupMotion(Motion):
+    """Increments to the rigid motions of G groups, all in mm: three rotations times a radius, three translations.
+
+    A zero vector leaves the control points where they are. Rotations turn about the group's own centre and are scaled
+    by its radius of gyration, so that a unit step in any parameter moves the implant by at most about 1 mm.
+
+    Args:
+        field: Control points, and where they are.
+        cloud: The implant: what the control points carry decides how they are grouped.
+        num_groups: G; fewer where fewer control points carry any of the implant.
+        prior: What speaks against bending.
+        from_rest: The motions start from the undeformed implant, not from where the control points are.
+    """
+
+    def __init__(
+        self,
+        field: SplineField,
+        cloud: ImplantPointCloud,
+        num_groups: int,
+        prior: BendingPrior,
+        *,
+        from_rest: bool = False,
+    ) -> None:
+        self.field, self.grid, self.prior = field, field.grid, prior
+        coarse, solid = cloud.coarsened_to(_CARRIED_PITCH_MM), cloud.coarsened_to(_SOLID_PITCH_MM)
+        self.weights = control_point_volumes(self.grid, coarse.points, coarse.volumes)
+        most = int(carrying(self.weights).sum())
+        self.labels = cluster_control_points(self.grid, self.weights, min(num_groups, most))
+        self.elasticity = Elasticity(self.grid, self.labels, solid.points, solid.volumes)
+        self.centers = group_centers(self.grid, self.labels)
+        so_far = field.control_points.detach().double().reshape(-1, 3)
+        self._start_from(torch.zeros_like(so_far) if from_rest else so_far)
+
+    def _start_from(self, displacements: Tensor) -> None:
+        """Motions, pivots and radii of the groups of control points (C, 3) that have moved by so much."""
+        positions = self.grid.positions().double().reshape(-1, 3)
+        weights = self.weights.flatten().double() + 1e-6 * self.weights.double().mean()
+        rotations, translations, pivots, radii = [], [], [], []
+        for group, center in enumerate(self.centers):
+            members = self.labels.flatten() == group
+            here, weight = positions[members], weights[members]
+            motion = fit_rigid(here, here + displacements[members])
+            pivot = (weight[:, None] * here).sum(0) / weight.sum()
+            radii.append(((weight[:, None] * (here - pivot) ** 2).sum() / weight.sum()).sqrt())
+            rotations.append(motion[:3, :3])
+            translations.append(motion[:3, :3] @ center + motion[:3, 3] - center)
+            pivots.append(motion[:3, :3] @ pivot + motion[:3, 3])
+        self.rotations, self.translations = torch.stack(rotations), torch.stack(translations)
+        self.pivots, self.radii = torch.stack(pivots), torch.stack(radii).clamp_min(_LEAST_RADIUS_MM)
+
+    @property
+    def num_parameters(self) -> int:  # type: ignore[override]
+        """Six a group."""
+        return 6 * len(self.centers)
+
+    def group_motions(self, steps: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations (K, G, 3, 3) and translations (K, G, 3) of the groups about their centres, R_g and t_g.
+
+        Args:
+            steps: Shape (K, 6 G), mm.
+        """
+        steps = steps.unflatten(-1, (-1, 6))
+        turn = rotation_from_vector(steps[..., :3] / self.radii[:, None].to(steps))
+        pivots, centers = self.pivots.to(steps), self.centers.to(steps)
+        rotations = turn @ self.rotations.to(steps)
+        start = centers + self.translations.to(steps) - pivots
+        moved = (turn @ start[..., None])[..., 0] + pivots + steps[..., 3:]
+        return rotations, moved - centers
+
+    def in_grid(self, steps: Tensor) -> Tensor:
+        """Motions (K, 4 G, 3) in the grid's axes, see `motion_coefficients`."""
+        return motion_coefficients(*self.group_motions(steps))
+
+    def features(self, points: Tensor) -> Tensor:
+        """Moments of the B-splines' weights, see `moment_features`."""
+        return moment_features(self.grid, self.labels, points)
+
+    def coefficients(self, steps: Tensor) -> Tensor:
+        """Translations and rotations of the groups, in the implant's axes."""
+        return self.grid.to_implant(self.in_grid(steps))
+
+    def control_points(self, steps: Tensor) -> Tensor:
+        """Control-point displacements (K, nx, ny, nz, 3)."""
+        return control_points_from_groups(self.grid, self.labels, *self.group_motions(steps))
+
+    def penalty(self, steps: Tensor) -> Tensor:
+        """beta R (eq. 5) and the weighted elastic energy."""
+        diffusion = diffusion_penalty(self.control_points(steps), self.grid)
+        return self.prior.beta * diffusion + self.prior.stiffness * self.elasticity.energy(self.in_grid(steps))
+
+    @torch.no_grad()
+    def accept(self, steps: Tensor) -> Tensor:
+        """The best common rigid motion of the control points; the rest stays with them."""
+        self.field.control_points.copy_(self.control_points(steps[None])[0])
+        self.field.labels.copy_(self.labels)
+        return self.field.remove_common_rigid(self.weights)

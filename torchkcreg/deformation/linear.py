@@ -1,0 +1,130 @@
+"""Deformations that are linear in a few amounts, turned and shifted as a whole: rigid ones, modes, superelements."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchkcreg.deformation.model import Deformation, Level, Motion
+from torchkcreg.geometry import rigid_matrix, rotation_from_vector
+from torchkcreg.implant import ImplantPointCloud
+
+
+class LinearDeformation(Deformation):
+    """Displacements ``u(x) = sum_m q_m shape_m(x)``; override :meth:`shapes`, and maybe :meth:`prior`.
+
+    Args:
+        num_amounts: M, how many shapes there are. A shape should move the implant by about 1 mm.
+
+    Attributes:
+        amounts: Parameter q (M,), float64.
+
+    >>> class Bow(LinearDeformation):
+    ...     def shapes(self, points):
+    ...         x, y, z = points.unbind(-1)
+    ...         return torch.stack([0 * x, (z / 50) ** 2, 0 * x], dim=-1)[..., None, :]
+    >>> bow = Bow(1)
+    >>> bow.amounts.data.fill_(2.0)
+    tensor([2.], dtype=torch.float64)
+    >>> bow.displacement(torch.tensor([[0.0, 0.0, 50.0]])).tolist()
+    [[0.0, 2.0, 0.0]]
+    """
+
+    model = "linear"
+
+    def __init__(self, num_amounts: int) -> None:
+        super().__init__()
+        self.amounts = nn.Parameter(torch.zeros(num_amounts, dtype=torch.float64))
+
+    def shapes(self, points: Tensor) -> Tensor:
+        """Displacements (..., N, M, 3) of points (..., N, 3) by an amount of one of each shape, mm."""
+        raise NotImplementedError
+
+    def prior(self, amounts: Tensor) -> Tensor:
+        """What speaks against amounts (K, M) but the images, in units of the loss, shape (K,); nothing by default."""
+        return amounts.new_zeros(amounts.shape[:-1])
+
+    def displacement(self, points: Tensor) -> Tensor:
+        """Displacements u, mm, of points (..., N, 3) in the implant's frame."""
+        shapes = self.shapes(points)
+        return torch.einsum("...mi,m->...i", shapes, self.amounts.to(shapes)).to(points)
+
+    def motion(self, cloud: ImplantPointCloud, level: Level) -> LinearMotion:
+        """Three rotations, three translations and, unless the level is rigid, the amounts."""
+        return LinearMotion(self, cloud, free=not level.is_rigid)
+
+
+class RigidDeformation(LinearDeformation):
+    """No deformation: the implant moves as a whole."""
+
+    model = "rigid"
+
+    def __init__(self) -> None:
+        super().__init__(0)
+
+    def shapes(self, points: Tensor) -> Tensor:
+        """None, (..., N, 0, 3)."""
+        return points.new_zeros(*points.shape[:-1], 0, 3)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nothing but the model's name."""
+        return {"model": self.model}
+
+
+class LinearMotion(Motion):
+    """Rotation and translation of the whole implant, all in mm, and changes of a linear deformation's amounts.
+
+    ``x + u(x)`` becomes ``R (x + sum_m q_m shape_m(x) - c) + c + t``: the shapes turn with the implant.
+
+    Args:
+        deformation: Where the motion starts.
+        cloud: The implant; its middle is c, and its radius of gyration makes millimetres of angles.
+        free: Whether the amounts may change.
+    """
+
+    def __init__(self, deformation: LinearDeformation, cloud: ImplantPointCloud, *, free: bool) -> None:
+        self.deformation, self.free = deformation, free
+        self.start = deformation.amounts.detach().clone()
+        coarse = cloud.coarsened_to(1.0)
+        points, share = coarse.points.double(), (coarse.volumes / coarse.volumes.sum()).double()[:, None]
+        self.center = (share * points).sum(0)
+        self.radius = (share * (points - self.center) ** 2).sum().sqrt()
+        self.num_parameters = 6 + (len(self.start) if free else 0)
+
+    def features(self, points: Tensor) -> Tensor:
+        """1, x - c, then the shapes' three components, one shape after the other."""
+        points = points.double()
+        with torch.no_grad():
+            shapes = self.deformation.shapes(points).flatten(-2)
+        return torch.cat([torch.ones_like(points[..., :1]), points - self.center, shapes], dim=-1)
+
+    def coefficients(self, steps: Tensor) -> Tensor:
+        """t, then R - I, then q_m R for each shape."""
+        rotation, turned = self._rotation(steps), self._rotation(steps).mT
+        rigid = torch.cat([steps[:, None, 3:6], turned - torch.eye(3).to(rotation)], dim=1)
+        amounts = self._amounts(steps)
+        return torch.cat([rigid, (amounts[..., None, None] * turned[:, None]).flatten(1, 2)], dim=1)
+
+    def penalty(self, steps: Tensor) -> Tensor:
+        """The deformation's prior."""
+        return self.deformation.prior(self._amounts(steps))
+
+    @torch.no_grad()
+    def accept(self, steps: Tensor) -> Tensor:
+        """The rotation and translation; the amounts have gone into the deformation."""
+        self.deformation.amounts.copy_(self._amounts(steps[None])[0])
+        turn = self._rotation(steps[None])[0]
+        shift = self.center + steps[3:6].double() - turn @ self.center
+        motion = rigid_matrix(torch.zeros_like(shift), shift)
+        motion[:3, :3] = turn
+        return motion
+
+    def _rotation(self, steps: Tensor) -> Tensor:
+        return rotation_from_vector(steps[:, :3] / self.radius)
+
+    def _amounts(self, steps: Tensor) -> Tensor:
+        if self.free:
+            return self.start + steps[:, 6:]
+        return self.start.to(steps).expand(len(steps), -1)

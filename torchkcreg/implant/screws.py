@@ -1,0 +1,126 @@
+"""A screw as far as its shadow goes: a cylinder in the implant's frame."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from torchkcreg.geometry import across, rotation_about, transform_points
+from torchkcreg.implant.cylinders import cylinder_cloud, cylinder_mesh
+from torchkcreg.implant.point_cloud import ImplantPointCloud
+
+Point = tuple[float, float, float]
+
+_COMMON_LENGTH_MM, _COMMON_RADIUS_MM = 24.0, 2.0  # about those of most screws
+
+
+@dataclass(frozen=True)
+class Screw:
+    """A cylinder in the implant's frame, mm.
+
+    Attributes:
+        start: Centre (x, y, z) of its head's end, in the hole's opening.
+        end: Its tip.
+        radius: Of its shaft.
+        material: Name of its material.
+        name: How results refer to it.
+
+    Raises:
+        ValueError: If start and end coincide, are not three finite numbers each, or the radius is not positive.
+
+    >>> screw = Screw((0, 0, 0), (0, 0, 20), 1.75)
+    >>> screw.length, round(float(screw.mesh().volume), 2)
+    (20.0, 192.42)
+    """
+
+    start: Point
+    end: Point
+    radius: float
+    material: str = "steel"
+    name: str = "screw"
+
+    def __post_init__(self) -> None:
+        for which in ("start", "end"):
+            object.__setattr__(self, which, _triple(getattr(self, which), which))
+        object.__setattr__(self, "radius", float(self.radius))
+        if not self.length > 0:
+            raise ValueError(f"start and end of {self.name} must be two different points, got {self.start} twice")
+        if not 0 < self.radius < np.inf:
+            raise ValueError(f"radius of {self.name} must be a positive length in mm, got {self.radius}")
+
+    @property
+    def length(self) -> float:
+        """From start to end, mm."""
+        return float(np.linalg.norm(np.subtract(self.end, self.start)))
+
+    def with_length(self, length: float) -> Screw:
+        """The screw with its tip elsewhere along its axis."""
+        axis = np.subtract(self.end, self.start) / self.length
+        return replace(self, end=tuple(np.add(self.start, length * axis)))
+
+    def with_radius(self, radius: float) -> Screw:
+        """The screw, thicker or thinner."""
+        return replace(self, radius=radius)
+
+    def same_side(self, other: Screw) -> bool:
+        """Whether two screws point the same way."""
+        return float(np.subtract(self.end, self.start) @ np.subtract(other.end, other.start)) > 0
+
+    def overlaps(self, other: Screw) -> bool:
+        """Whether two screws share a hole or, side by side in a combination hole, run into each other."""
+        way = np.subtract(self.start, other.start)
+        axis = np.subtract(other.end, other.start) / other.length
+        return float(np.linalg.norm(way - (way @ axis) * axis)) < self.radius + other.radius
+
+    def moved(self, rotation: Tensor, shift: Tensor) -> Screw:
+        """The screw, turned about its start by a rotation vector (3,) and then shifted by a vector (3,), mm."""
+        ends = torch.tensor([self.start, self.end], dtype=torch.float64)
+        turned = transform_points(rotation_about(ends[0], rotation.cpu().double()), ends) + shift.cpu().double()
+        return replace(self, start=tuple(turned[0].tolist()), end=tuple(turned[1].tolist()))
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Its surface, a prism of exactly its volume."""
+        return cylinder_mesh(self.start, self.end, self.radius)
+
+    def cloud(self, pitch: float = 0.25, *, dtype: torch.dtype = torch.float32) -> ImplantPointCloud:
+        """Its nodes, ``pitch`` mm apart."""
+        return cylinder_cloud(self.start, self.end, self.radius, pitch, dtype=dtype)
+
+    def stretched_cloud(self, pitch: float) -> ImplantPointCloud:
+        """Its nodes, those of a common screw stretched: in no time, but on a lattice of its own."""
+        common = _common_cloud(pitch)
+        start, end = (torch.tensor(p, dtype=torch.float64) for p in (self.start, self.end))
+        axis = (end - start) / (end - start).norm()
+        thicker, longer = self.radius / _COMMON_RADIUS_MM, self.length / _COMMON_LENGTH_MM
+        stretch = torch.tensor([[thicker], [thicker], [longer]]) * torch.cat([across(axis), axis[None]])
+        volumes = common.volumes * (thicker**2 * longer)
+        return ImplantPointCloud(start + common.points @ stretch, volumes, common.cell @ stretch)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types under the names of the fields, for files."""
+        return {
+            "start": list(self.start),
+            "end": list(self.end),
+            "radius": self.radius,
+            "material": self.material,
+            "name": self.name,
+        }
+
+
+def _triple(values: Any, name: str) -> Point:
+    numbers = tuple(float(x) for x in values)
+    if len(numbers) != 3 or not np.isfinite(numbers).all():
+        raise ValueError(f"{name} must be three finite numbers in mm, got {numbers}")
+    return numbers
+
+
+@functools.cache
+def _common_cloud(pitch: float) -> ImplantPointCloud:
+    tip = (0.0, 0.0, _COMMON_LENGTH_MM)
+    return cylinder_cloud((0.0, 0.0, 0.0), tip, _COMMON_RADIUS_MM, pitch, dtype=torch.float64)

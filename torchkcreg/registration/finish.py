@@ -1,0 +1,73 @@
+"""From a trainer at its end to a result that says how far it can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+from torchkcreg.scene import RegistrationData, Scene
+from torchkcreg.similarity import GradientCorrelation, GradientDifference
+
+from .basins import Rival
+from .config import RegistrationConfig, Stage
+from .result import RegisteredImplant, RegistrationResult
+from .stage_run import StageRun, Terms, changed, similarities
+from .verdict import diagnose, judge
+
+_COARSE_BIN = 2  # an expected error needs no finer pixels
+
+
+def finished(
+    scene: Scene,
+    data: RegistrationData,
+    config: RegistrationConfig,
+    terms: Terms,
+    last: Stage,
+    *,
+    history: Sequence[dict[str, Any]],
+    records: Sequence[dict[str, Any]],
+    undone: dict[str, str],
+    rival: Rival | None,
+    stopped: str | None,
+) -> RegistrationResult:
+    """The result of a registration whose scene is at its end."""
+    run = StageRun(scene, data, last, config, terms=terms)
+    run.with_background()
+    gc = similarities(run, GradientCorrelation)  # in which every pixel counts alike
+    coarse = _diagnosed(run, data)
+    converged = _converged(history, last) and stopped is None
+    found = diagnose(coarse.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
+    status, reasons = judge(found)
+    if stopped is not None:
+        reasons = [*reasons, f"the registration was ended before its time: {stopped}"]
+        status = "doubtful" if status == "ok" else status
+    return RegistrationResult(
+        implants=[RegisteredImplant.of(assembly) for assembly in scene],
+        gc=gc,
+        history=list(history),
+        stages=list(records),
+        config=config,
+        seed=config.seed,
+        status=status,
+        warnings=reasons,
+        diagnostics=asdict(found),
+        intensity={name: float(value.detach()) for name, value in scene.intensity.named_parameters()},
+        scene=scene,
+    )
+
+
+def _diagnosed(run: StageRun, data: RegistrationData) -> StageRun:
+    """The last stage on pixels that are coarse enough to be quick, by a similarity that is a sum of squares."""
+    coarse = changed(replace(run, data=data), bin=max(run.stage.bin, _COARSE_BIN))
+    if run.terms.similarity is not None:
+        coarse = replace(coarse, terms=replace(run.terms, similarity=GradientDifference))
+    coarse.with_background()
+    if "reweight" in run.stage.before:
+        coarse.objective = coarse.objective.reweighted()
+    return coarse
+
+
+def _converged(history: Sequence[dict[str, Any]], last: Stage) -> bool:
+    ended = history[-1] if history else {"iteration": 0, "step_mm": 0.0}
+    return ended["iteration"] < last.iterations or ended["step_mm"] < 10 * last.tolerance

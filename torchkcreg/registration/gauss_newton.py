@@ -1,0 +1,98 @@
+"""Gauss-Newton, a damped step at a time."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from .config import Stage
+from .optimizer import Optimizer, Problem
+
+_NEGLIGIBLE = 2e-5  # of the loss
+
+
+class GaussNewton(Optimizer):
+    """Gauss-Newton with Levenberg-Marquardt damping (Marquardt 1963) and steps of at most ``stage.step_mm``.
+
+    The gradient is exact; the curvature is taken once and again when steps stop agreeing with it. It also ends with a
+    step that is taken and promised next to nothing: it moved what the images hardly show by micrometres.
+    """
+
+    _KEPT: ClassVar[tuple[str, ...]] = ("_parameters", "_loss", "_gradient", "_curvature", "_fresh", "_damping")
+
+    def __init__(self, problem: Problem, stage: Stage, seed: int) -> None:
+        super().__init__(problem, stage, seed)
+        self._parameters = self._zeros()
+        self._curvature: Tensor | None = None
+        self._damping, self._fresh = 1e-3, True
+
+    def ask(self) -> Tensor:
+        """Where the next step leads."""
+        if self._curvature is None:
+            self._loss, self._gradient = self.problem.loss_and_gradient(self._parameters)
+            self._curvature = self.problem.curvature(self._parameters)
+        return self._within_bounds(self._curvature)[None]
+
+    def tell(self, candidates: Tensor, losses: Tensor) -> None:
+        """The step is taken if it leads down; else the next one is shorter."""
+        if self._curvature is None:
+            raise RuntimeError("ask comes before tell")
+        trial, trial_loss = candidates[0], float(losses[0])
+        step = trial - self._parameters
+        predicted = float(-(self._gradient @ step) - 0.5 * step @ self._curvature @ step)
+        size = float(step.abs().max())
+        gain = (self._loss - trial_loss) / max(predicted, 1e-16)
+        taken = trial_loss < self._loss
+        if taken:
+            self._parameters = trial
+            self._loss, self._gradient = self.problem.loss_and_gradient(trial)
+            self._damping = max(self._damping / 5, 1e-6) if gain > 0.5 else self._damping * 2
+            self._fresh = False
+        else:
+            self._damping *= 8
+        lost = self._fresh and self._damping > 1e6
+        small = size < self.stage.tolerance or (taken and predicted < _NEGLIGIBLE * self._loss)
+        self._advance(self._loss, size, end=small or lost)
+        if not self.done and not self._fresh and gain < 0.25:
+            self._curvature, self._fresh = self.problem.curvature(self._parameters), True
+
+    def best(self) -> Tensor:
+        """Where it is."""
+        return self._parameters
+
+    def state_dict(self) -> dict[str, Any]:
+        """Parameters, what is known of the loss there, and damping; nothing before the first iteration."""
+        if self._curvature is None:
+            return {}
+        return {**{name: getattr(self, name) for name in self._KEPT}, **self._ended()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """All of them."""
+        if not state:
+            return
+        for name in self._KEPT:
+            value = state[name]
+            setattr(self, name, value.clone() if isinstance(value, Tensor) else value)
+        self._end_as(state)
+
+    def _within_bounds(self, curvature: Tensor) -> Tensor:
+        """Where a damped step leads inside the bounds; the free parameters know which ones a bound holds back."""
+        here, gradient = self._parameters, self._gradient
+        wanted = here + self._damped_step(curvature, gradient)
+        trial = self.problem.project(wanted[None])[0]
+        free = trial == wanted
+        if free.all() or not free.any():
+            return trial
+        held = (trial - here)[~free]
+        rest = gradient[free] + curvature[free][:, ~free] @ held
+        trial[free] = here[free] + self._damped_step(curvature[free][:, free], rest)
+        return self.problem.project(trial[None])[0]
+
+    def _damped_step(self, curvature: Tensor, gradient: Tensor) -> Tensor:
+        """The Levenberg-Marquardt step, shortened until no parameter moves by more than ``stage.step_mm``."""
+        diagonal = curvature.diagonal()
+        floor = 1e-6 * diagonal.mean()
+        step = -torch.linalg.solve(curvature + torch.diag(self._damping * diagonal + floor), gradient)
+        return step * min(1.0, self.stage.step_mm / max(float(step.abs().max()), 1e-12))

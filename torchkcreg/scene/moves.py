@@ -1,0 +1,144 @@
+"""All that a stage may change in a scene, as named blocks of one vector of parameters."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchkcreg.deformation import Level
+from torchkcreg.implant import Screw
+from torchkcreg.parameters import ParameterBlock, ParameterBlocks
+
+from .assembly import Assembly
+from .bound_motion import BoundMotion
+from .physics import PhysicsParameters
+from .scene import Scene
+from .screw_shapes import ScrewShapes
+from .state import State
+from .tilts import ComponentTilts
+from .view import View
+
+_SCREW_PITCH_MM = 0.5
+_DIFFERENCE_MM = 1e-3
+_NODES_PITCH_MM = 2.0  # distances between candidates need no finer nodes
+
+
+class Moves(ParameterBlocks):
+    """What a stage may change in a scene: increments to its state when they are made, in mm or worth as much.
+
+    Args:
+        scene: In its present state.
+        view: Of it.
+        level: How finely deformations move.
+        estimate: Parameters of the intensity model that are estimated along.
+        screws: Lengths and radii of found screws are, too.
+        tilts: Components may turn a little about their heads.
+        prior_weight: Loss for a parameter of the intensity model, or a tilt, that is a standard deviation off.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        view: View,
+        level: Level,
+        *,
+        estimate: Sequence[str] = (),
+        screws: bool = False,
+        tilts: bool = False,
+        prior_weight: float = 0.0,
+    ) -> None:
+        self.scene, self.view = scene, view
+        blocks: dict[str, ParameterBlock] = {}
+        self.parts = [_Part(assembly, view, nodes, level) for assembly, nodes in zip(scene, view.nodes, strict=True)]
+        for part in self.parts:
+            blocks[f"motion of {part.name}"] = part.bound.motion
+        self.physics = PhysicsParameters(scene.intensity, estimate, view.pixel_px, prior_weight)
+        blocks["physics"] = self.physics
+        for part in self.parts:
+            if screws and part.assembly.found:
+                part.shapes = ScrewShapes(part.assembly.found, functools.partial(screw_path, part.assembly, view))
+                blocks[f"screws of {part.name}"] = part.shapes
+            if tilts and len(part.assembly.components):
+                part.tilts = ComponentTilts(part.assembly, prior_weight)
+                blocks[f"tilts of {part.name}"] = part.tilts
+        super().__init__(blocks)
+
+    def state(self, parameters: Tensor) -> State:
+        """The scene's candidates with parameters (K, D)."""
+        steps = self.split(parameters)
+        added: dict[str, Tensor] = {}
+        placements = []
+        for part in self.parts:
+            turns = part.tilts.motions(steps[f"tilts of {part.name}"]) if part.tilts else None
+            placements.append(part.bound(steps[f"motion of {part.name}"], turns))
+            if part.shapes:
+                for name, path in part.shapes.added(steps[f"screws of {part.name}"]).items():
+                    added[name] = path if name not in added else added[name] + path
+        return State(tuple(placements), self.physics.arguments(steps["physics"]), added)
+
+    def displacements(self, parameters: Tensor) -> Tensor:
+        """Displacements (K, S) of all implants' nodes, so weighted that their squares sum to the mean square, mm^2."""
+        steps = self.split(parameters)
+        return (
+            torch.cat([part.displacements(steps[f"motion of {part.name}"]) for part in self.parts], dim=-1)
+            / len(self.parts) ** 0.5
+        )
+
+    @torch.no_grad()
+    def shift(self, number: int, direction: Tensor) -> Tensor:
+        """The step (D,) that shifts an assembly, by its number, by 1 mm along a direction (3,) of its own frame."""
+        part, name, direction = self.parts[number], f"motion of {self.parts[number].name}", direction.double()
+        offsets = _DIFFERENCE_MM * torch.eye(self[name].num_parameters).to(direction)
+        slopes = (part.displacements(offsets) - part.displacements(-offsets)) / (2 * _DIFFERENCE_MM)
+        wanted = (part.share * direction).flatten()
+        steps = {name: block.at_rest()[0].to(direction) for name, block in self.items()}
+        steps[name] = torch.linalg.lstsq(slopes.T, wanted[:, None]).solution[:, 0]
+        return torch.cat(list(steps.values()))
+
+    @torch.no_grad()
+    def accept(self, parameters: Tensor) -> None:
+        """Moves the scene to parameters (D,); common rigid motions go from the deformations into the poses."""
+        steps = self.split(parameters)
+        for part in self.parts:
+            part.accept(steps)
+        self.physics.accept(steps["physics"])
+
+
+class _Part:
+    """What a stage may change of one assembly."""
+
+    def __init__(self, assembly: Assembly, view: View, nodes: Tensor, level: Level) -> None:
+        self.assembly, self.name = assembly, assembly.name
+        self.bound = BoundMotion(assembly, assembly.deformation.motion(assembly.implant, level), nodes)
+        self.shapes: ScrewShapes | None = None
+        self.tilts: ComponentTilts | None = None
+        coarse = assembly.implant.coarsened_to(_NODES_PITCH_MM)
+        self.share = (coarse.volumes.double() / coarse.volumes.double().sum()).sqrt()[:, None]
+        self.features = self.bound.motion.features(coarse.points)
+
+    def displacements(self, steps: Tensor) -> Tensor:
+        """Displacements (K, 3 N) of the nodes, weighted."""
+        return ((self.features @ self.bound.motion.coefficients(steps)) * self.share).flatten(1)
+
+    def accept(self, steps: dict[str, Tensor]) -> None:
+        """Moves the assembly."""
+        assembly = self.assembly
+        common = self.bound.motion.accept(steps[f"motion of {self.name}"])
+        assembly.implant_to_world.copy_(assembly.implant_to_world @ common)
+        if self.tilts:
+            assembly.tilts = self.tilts.vectors(steps[f"tilts of {self.name}"]).clone()
+        if assembly.found and (self.shapes or self.tilts):
+            screws = self.shapes.stepped(steps[f"screws of {self.name}"]) if self.shapes else assembly.found
+            still = torch.zeros_like(assembly.tilts)
+            shifts = self.tilts.shifts(steps[f"tilts of {self.name}"]) if self.tilts else still
+            assembly.place([s.moved(*by) for s, *by in zip(screws, assembly.tilts, shifts, strict=True)])
+
+
+@torch.no_grad()
+def screw_path(assembly: Assembly, view: View, screw: Screw) -> Tensor:
+    """Path lengths (V, rows, cols) in mm of a screw where an assembly now has it."""
+    motion = assembly.motion_at(torch.tensor(screw.start, dtype=torch.float64))
+    return view.cloud_path_lengths(screw.stretched_cloud(_SCREW_PITCH_MM), assembly.implant_to_world @ motion)

@@ -1,0 +1,149 @@
+"""A scene: implants in the beam and what the beam makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchkcreg.geometry import ConeBeamGeometry
+from torchkcreg.physics import IdentityIntensity, IntensityModel
+
+from .assembly import Assembly
+from .data import RegistrationData
+from .state import State
+from .view import View
+
+
+class Scene(nn.Module):
+    """Implants with their poses, deformations and components, and the model of the intensity behind them.
+
+    Called with a geometry it gives the line integrals that its views show, differentiable in all of the scene's
+    parameters.
+
+    Args:
+        assemblies: One implant or several, each with what is fixed to it.
+        intensity: Path lengths of the materials, in the order of :attr:`materials`, to line integrals.
+        metals: Names of materials that screws found in the implants' holes may be of, besides the implants' own.
+        materials: Names in the order of the path lengths; those of implants, metals and components when None.
+        backend: Of the projector: "auto", "cpp" or "torch".
+
+    >>> import trimesh
+    >>> from torchkcreg.deformation import RigidDeformation
+    >>> from torchkcreg.geometry import circular_geometry
+    >>> from torchkcreg.implant import ImplantPointCloud
+    >>> cube = ImplantPointCloud.from_mesh(trimesh.creation.box((10.0, 10.0, 10.0)), pitch=0.5)
+    >>> views = circular_geometry([0, 90], sad=404, sdd=538, det_shape=(32, 32), pixel_spacing=(1.0, 1.0))
+    >>> scene = Scene([Assembly(cube, RigidDeformation())])
+    >>> round(scene(views).amax().item(), 1)
+    10.0
+    """
+
+    assemblies: Sequence[Assembly]
+    intensity: IntensityModel
+    materials: list[str]
+
+    def __init__(
+        self,
+        assemblies: Sequence[Assembly],
+        intensity: IntensityModel | None = None,
+        *,
+        metals: Sequence[str] = (),
+        materials: Sequence[str] | None = None,
+        backend: str = "auto",
+    ) -> None:
+        super().__init__()
+        if not assemblies:
+            raise ValueError("a scene needs at least one implant, got none")
+        names = [assembly.name for assembly in assemblies]
+        if len(set(names)) < len(names):
+            raise ValueError(f"implants must have names of their own, got {', '.join(names)}")
+        self.assemblies = nn.ModuleList(assemblies)  # type: ignore[assignment]
+        self.intensity = IdentityIntensity() if intensity is None else intensity
+        self.metals, self.backend = list(metals), backend
+        own = [a.material for a in assemblies]
+        parts = [c.material for a in assemblies for c in a.components]
+        self.materials = list(dict.fromkeys([*own, *metals, *parts])) if materials is None else list(materials)
+        if missing := {*own, *metals, *parts} - set(self.materials):
+            raise ValueError(f"materials must hold all that the scene is made of, got none of {', '.join(missing)}")
+
+    def __iter__(self) -> Iterator[Assembly]:
+        return iter(self.assemblies)
+
+    def view(self, data: RegistrationData | ConeBeamGeometry, **scale: Any) -> View:
+        """What is seen of the scene near its present state; see :class:`View` for ``scale``."""
+        return View(list(self.assemblies), self.materials, data, backend=self.backend, **scale)
+
+    def state(self, view: View) -> State:
+        """The scene as it is, as one candidate."""
+        placements = [a.placement(nodes) for a, nodes in zip(self.assemblies, view.nodes, strict=True)]
+        return State(tuple(placements), self.intensity.arguments(view.pixel_px))
+
+    def path_lengths(self, view: View | ConeBeamGeometry, state: State | None = None) -> Tensor:
+        """Path lengths (K, M, V, rows, cols) on the view's rendered pixels, mm; K is 1 for the scene as it is.
+
+        Where the intensity model knows a background, it is the last of the materials.
+        """
+        view = self.view(view) if isinstance(view, ConeBeamGeometry) else view
+        state = self.state(view) if state is None else state
+        paths = view.path_lengths(state.placements, len(self.materials))
+        for name, added in state.added.items():
+            index = self.materials.index(name)
+            paths[index] = paths[index] + added
+        if self.intensity.has_background:
+            unknown = view.matrices.new_zeros(()) if view.background is None else view.background
+            paths.append(unknown.expand(paths[0].shape))
+        return torch.stack(paths, dim=-4)
+
+    def forward(self, view: View | ConeBeamGeometry, state: State | None = None) -> Tensor:
+        """Line integrals (K, V, rows, cols) of candidates; of the scene as it is, (V, rows, cols).
+
+        Args:
+            view: See :meth:`view`; or a geometry, seen whole.
+            state: Candidates; the scene as it is when None.
+        """
+        view = self.view(view) if isinstance(view, ConeBeamGeometry) else view
+        candidates = self.state(view) if state is None else state
+        paths, physics = self.path_lengths(view, candidates), self.arguments(view, candidates)
+        lines = self.intensity(paths, pooling=view.oversampling, **physics)
+        if view.following is not None and self.intensity.has_background:
+            levels = torch.stack([physics["scatter"], physics["scatter_removed"]], dim=-1)
+            lines = view.following(lines, levels)
+        return lines[0] if state is None else lines
+
+    def arguments(self, view: View, state: State) -> dict[str, Tensor]:
+        """Keyword arguments of the intensity model for candidates as a view has them."""
+        physics = dict(state.physics)
+        if view.data is not None and view.data.scatter_shapes is not None and self.intensity.has_background:
+            physics["scatter_shapes"] = view.data.scatter_shapes
+        return physics
+
+    def without_components(self, assembly: Assembly) -> Scene:
+        """The scene with one of its implants alone, without what is fixed to it; it shares everything else."""
+        assemblies = [a.bare() if a is assembly else a for a in self.assemblies]
+        return Scene(assemblies, self.intensity, metals=self.metals, materials=self.materials, backend=self.backend)
+
+    def kept(self) -> dict[str, Any]:
+        """A copy of what a registration changes, as tensors and plain types, for :meth:`restore` and checkpoints."""
+        return {
+            "assemblies": [assembly.kept() for assembly in self.assemblies],
+            "intensity": {name: value.detach().clone() for name, value in self.intensity.named_parameters()},
+        }
+
+    @torch.no_grad()
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Goes back to what :meth:`kept` gave."""
+        for assembly, state in zip(self.assemblies, kept["assemblies"], strict=True):
+            assembly.restore(state)
+        for name, value in self.intensity.named_parameters():
+            value.copy_(kept["intensity"][name])
+
+    def description(self) -> dict[str, list[float]]:
+        """What tells a registration of this scene from one of another, as plain numbers."""
+        found: dict[str, list[float]] = {"the intensity model": [len(list(self.intensity.parameters()))]}
+        for assembly in self.assemblies:
+            named = "" if len(self.assemblies) == 1 else f" of {assembly.name}"
+            found |= {f"{text}{named}": numbers for text, numbers in assembly.description().items()}
+        return found
