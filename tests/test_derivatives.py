@@ -9,12 +9,13 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.deformation import FreeFormDeformation, default_grid
+from torchkcreg.deformation import FreeFormDeformation
 from torchkcreg.geometry import VolumeGrid, circular_geometry
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.physics import PolyenergeticTransmission, material, tungsten_spectrum
 from torchkcreg.projector import PointCloudProjector, VolumeProjector, cell_footprint, project_mesh
 from torchkcreg.similarity import gradient_correlation
+from torchkcreg.splines import default_grid
 
 GEOMETRY = circular_geometry([0, 70], sad=404, sdd=538, det_shape=(14, 12), pixel_spacing=(4.0, 4.0))
 CLOUD = ImplantPointCloud.from_mesh(trimesh.creation.box((7.3, 11.1, 17.7)), pitch=3.0)

@@ -14,6 +14,8 @@ FLOORS = {
     "similarity": 1,
     "implant": 2,
     "projector": 2,
+    "optimization": 1,
+    "splines": 2,
     "deformation": 3,
     "scene": 4,
     "registration": 5,
@@ -25,6 +27,7 @@ FLOORS = {
     "experiments": 7,
     "cli": 8,
 }
+MOST_LEVELS = 6
 FOLDERS = sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file())
 
 
@@ -66,6 +69,31 @@ def test_a_folder_imports_only_from_lower_floors_and_knows_none_on_its_own(folde
         assert imports_of(path) <= FLOORS.keys(), f"{where} imports from the package's top, which holds every floor"
         for other in imports_of(path) - {folder}:
             assert FLOORS[other] < FLOORS[folder], f"{where} (floor {FLOORS[folder]}) imports {other}"
+
+
+def neighbours_of(path: Path) -> set[str]:
+    """Files of the same folder that a file imports, lazily or for its types only, too."""
+    package = ["torchkcreg", path.parent.name]
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        module = (node.module or "").split(".") if node.module else []
+        full = [*package, *module] if node.level == 1 else module if node.level == 0 else []
+        if full[:2] == package:
+            found |= {full[2]} if len(full) > 2 else {alias.name for alias in node.names}
+    return {name for name in found if (path.parent / f"{name}.py").is_file()}
+
+
+@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder != "projector"])
+def test_the_files_of_a_folder_stand_on_few_levels_and_in_no_circle(folder):
+    imports = {p.stem: neighbours_of(p) for p in (PACKAGE / folder).glob("*.py") if p.stem != "__init__"}
+    levels: dict[str, int] = {}
+    while len(levels) < len(imports):
+        ready = [name for name in imports if name not in levels and imports[name] <= levels.keys()]
+        assert ready, f"{folder}: {', '.join(sorted(imports.keys() - levels.keys()))} import each other"
+        levels |= {name: 1 + max((levels[below] for below in imports[name]), default=0) for name in ready}
+    assert max(levels.values(), default=0) <= MOST_LEVELS, sorted(levels.items(), key=lambda item: item[1])
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))

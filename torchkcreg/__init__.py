@@ -48,11 +48,14 @@ _FOLDERS = (
     "implant",
     "io",
     "physics",
+    "optimization",
     "projector",
     "reconstruction",
     "registration",
+    "scene",
     "similarity",
     "simulation",
+    "splines",
     "visualization",
 )
 

@@ -5,14 +5,9 @@ import itertools
 import pytest
 import torch
 
-from torchkcreg.deformation import (
-    ControlPointGrid,
-    cluster_control_points,
-    control_point_volumes,
-    default_grid,
-    spline_displacement,
-)
+from torchkcreg.deformation import cluster_control_points, control_point_volumes
 from torchkcreg.geometry import rigid_matrix, transform_points
+from torchkcreg.splines import ControlPointGrid, default_grid, spline_displacement
 
 POSE = rigid_matrix(
     torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64), torch.tensor([30.0, -5.0, 11.0], dtype=torch.float64)

@@ -4,15 +4,9 @@ import pytest
 import SimpleITK as sitk
 import torch
 
-from torchkcreg.deformation import (
-    ControlPointGrid,
-    FreeFormDeformation,
-    cluster_control_points,
-    control_points_from_groups,
-    group_rigid_motions,
-    spline_displacement,
-)
+from torchkcreg.deformation import FreeFormDeformation, cluster_control_points, control_points_from_groups
 from torchkcreg.geometry import rigid_matrix, rotation_from_vector, transform_points
+from torchkcreg.splines import ControlPointGrid, group_rigid_motions, spline_displacement
 
 POSE = rigid_matrix(
     torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64), torch.tensor([30.0, -5.0, 11.0], dtype=torch.float64)

@@ -4,18 +4,17 @@ import pytest
 import torch
 
 from torchkcreg.deformation import (
-    ControlPointGrid,
     FreeFormDeformation,
     cluster_control_points,
     control_points_from_groups,
     group_centers,
     group_moment_gradients,
     group_moments,
-    group_rigid_motions,
     moment_features,
     motion_coefficients,
 )
 from torchkcreg.geometry import rigid_matrix, rotation_from_vector, transform_points
+from torchkcreg.splines import ControlPointGrid, group_rigid_motions
 
 POSE = rigid_matrix(
     torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64), torch.tensor([30.0, -5.0, 11.0], dtype=torch.float64)

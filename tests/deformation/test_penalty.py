@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from torchkcreg.deformation import ControlPointGrid, diffusion_penalty, without_rigid
+from torchkcreg.deformation import diffusion_penalty, without_rigid
 from torchkcreg.geometry import rigid_matrix, transform_points
+from torchkcreg.splines import ControlPointGrid
 
 GRID = ControlPointGrid((6, 5, 8), (8.75, 7.0, 25.0), torch.eye(4))
 

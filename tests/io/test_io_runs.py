@@ -7,10 +7,11 @@ import torch
 import trimesh
 from matplotlib.figure import Figure
 
-from torchkcreg.deformation import ControlPointGrid, FreeFormDeformation
+from torchkcreg.deformation import FreeFormDeformation
 from torchkcreg.geometry import rigid_matrix, transform_points
 from torchkcreg.io import RunFolder, read_config, read_run, result_from_dict, result_to_dict
 from torchkcreg.registration import RegisteredImplant, RegistrationConfig, RegistrationResult
+from torchkcreg.splines import ControlPointGrid
 
 RESULT_FILES = {"deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply", "history.json"}
 

@@ -2,9 +2,10 @@ import pytest
 import SimpleITK as sitk
 import torch
 
-from torchkcreg.deformation import ControlPointGrid, FreeFormDeformation
+from torchkcreg.deformation import FreeFormDeformation
 from torchkcreg.geometry import rigid_matrix, transform_points
 from torchkcreg.io import displacement_field, itk_transform, write_displacement_field, write_itk_transform
+from torchkcreg.splines import ControlPointGrid
 
 
 def random(*shape, seed=0):

@@ -13,12 +13,12 @@ from torchkcreg.deformation import (
     GroupMotion,
     Level,
     ModalMotion,
-    default_grid,
 )
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import RegistrationConfig, Scene, Stage
 from torchkcreg.simulation import locking_plate
+from torchkcreg.splines import default_grid
 
 GRID = {"grid_shape": (4, 4, 8), "grid_spacing_mm": (8.0, 8.0, 8.0)}
 CONFIG = RegistrationConfig(stages=(Stage(groups=8, modes=14, oversampling=1),), **GRID)

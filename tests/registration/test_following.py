@@ -8,7 +8,7 @@ from small_scene import SCREW, image, pose, scene
 from test_register import PLAIN
 
 from torchkcreg.registration import Stage, StageRun
-from torchkcreg.registration.stage_run import with_scatter_shapes
+from torchkcreg.registration.prepared import with_scatter_shapes
 from torchkcreg.scene import RegistrationData
 from torchkcreg.scene.following import FollowingBackground
 

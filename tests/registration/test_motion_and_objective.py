@@ -7,8 +7,8 @@ import torch
 from small_scene import SCREW, bend, geometry, image, objective, pose, scene
 
 from torchkcreg.geometry import transform_points
+from torchkcreg.optimization import Optimizer, iterate
 from torchkcreg.registration import OPTIMIZERS, Objective, RegistrationConfig, Stage
-from torchkcreg.registration.optimizer import Optimizer, iterate
 
 PLAIN = RegistrationConfig(grid_shape=(4, 4, 6), grid_spacing_mm=(10.0, 10.0, 12.0))
 STEEL = PLAIN.model_copy(update={"material": "steel"})

@@ -10,9 +10,8 @@ from small_scene import SCREW, image, scene
 from test_register import PLAIN
 
 from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.optimization import CMAES, GaussNewton, Optimizer, iterate
 from torchkcreg.registration import Stage, Trainer, build_scene
-from torchkcreg.registration.optimizer import Optimizer, iterate
-from torchkcreg.registration.optimizers import CMAES, GaussNewton
 
 
 def test_a_checkpoint_of_another_implant_is_refused() -> None:

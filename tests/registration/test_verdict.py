@@ -7,8 +7,7 @@ import torch
 from small_scene import RIGID, SCREW, image, pose, scene
 
 from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, Trainer
-from torchkcreg.registration.basins import Rival
-from torchkcreg.registration.verdict import Diagnostics, judge
+from torchkcreg.registration.verdict import Diagnostics, Rival, judge
 from torchkcreg.scene.physics import PhysicsParameters
 
 CONFIG = RegistrationConfig(stages=RIGID)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation.basis import SplineBasis
-from torchkcreg.deformation.grid import ControlPointGrid
+from torchkcreg.splines.basis import SplineBasis
+from torchkcreg.splines.grid import ControlPointGrid
 
 # A CP that carries less than this share of the most loaded one has no implant near it: it hardly moves a node, and
 # must not attract cuts.

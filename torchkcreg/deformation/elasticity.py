@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation.grid import ControlPointGrid
 from torchkcreg.deformation.groups import group_moment_gradients, moment_features
 from torchkcreg.deformation.strain import strain_energy
 from torchkcreg.geometry import transform_points
+from torchkcreg.splines.grid import ControlPointGrid
 
 
 class Elasticity:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchkcreg.deformation.grid import ControlPointGrid
 from torchkcreg.deformation.group_motion import GroupMotion
 from torchkcreg.deformation.modal_motion import ModalMotion
 from torchkcreg.deformation.model import Level, Motion
 from torchkcreg.deformation.prior import BendingPrior
 from torchkcreg.deformation.spline_field import SplineField
 from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.splines.grid import ControlPointGrid
 
 
 class FreeFormDeformation(SplineField):
@@ -27,7 +27,7 @@ class FreeFormDeformation(SplineField):
 
     Example:
         >>> import torch
-        >>> from torchkcreg.deformation import default_grid
+        >>> from torchkcreg.splines import default_grid
         >>> plate = torch.rand(500, 3) * torch.tensor([12.0, 4.0, 150.0])
         >>> deformation = FreeFormDeformation(default_grid(plate))
         >>> bool((deformation(plate) == plate).all())

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from torchkcreg.deformation.basis import SplineBasis
-from torchkcreg.deformation.grid import ControlPointGrid
+from torchkcreg.splines.basis import SplineBasis
+from torchkcreg.splines.grid import ControlPointGrid
 
 
 def group_centers(grid: ControlPointGrid, labels: Tensor) -> Tensor:

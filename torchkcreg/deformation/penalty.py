@@ -6,8 +6,8 @@ import math
 
 from torch import Tensor
 
-from torchkcreg.deformation.grid import ControlPointGrid
 from torchkcreg.geometry import fit_rigid, invert_rigid, transform_points
+from torchkcreg.splines.grid import ControlPointGrid
 
 
 def diffusion_penalty(control_points: Tensor, grid: ControlPointGrid, *, remove_rigid: bool = True) -> Tensor:

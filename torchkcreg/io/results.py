@@ -7,10 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import ControlPointGrid, Deformation, FreeFormDeformation, RigidDeformation
+from torchkcreg.deformation import Deformation, FreeFormDeformation, RigidDeformation
 from torchkcreg.implant import Screw
 from torchkcreg.io.files import finite_array, finite_number, plain
 from torchkcreg.registration import RegisteredImplant, RegistrationConfig, RegistrationResult
+from torchkcreg.splines import ControlPointGrid
 
 FORMAT = "torchkcreg deformation"
 FORMAT_VERSION = 2

@@ -1,12 +1,11 @@
 """Registration: the objective, its optimisers and the coarse-to-fine loop."""
 
+from torchkcreg.optimization import OPTIMIZERS, Optimizer, Progress
 from torchkcreg.scene import RegistrationData, Scene, with_background
 
 from .callbacks import Callback, ProgressBar, TrainerState
 from .config import RegistrationConfig, Stage, preset_stages
 from .objective import Objective
-from .optimizer import Optimizer, Progress
-from .optimizers import OPTIMIZERS
 from .register import Implant, build_scene, register
 from .result import RegisteredImplant, RegistrationResult
 from .screws import find_screws

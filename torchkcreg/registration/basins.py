@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -14,21 +12,6 @@ from .objective import Objective
 _STEP_MM = 2.0  # a coarse image's optimum is a few mm wide
 _WORSE = 1.5  # times the least loss: what fits no better is no candidate
 _MOST = 3
-
-
-@dataclass(frozen=True)
-class Rival:
-    """The second best of the places that were tried.
-
-    Attributes:
-        distance_mm: Root mean square distance of the implants' nodes there from where they fit best.
-        misfit: What is left unexplained of the images there.
-        best_misfit: What is left where they fit best.
-    """
-
-    distance_mm: float
-    misfit: float
-    best_misfit: float
 
 
 @torch.no_grad()

@@ -6,10 +6,10 @@ from typing import Any, Protocol
 
 from tqdm import tqdm
 
+from torchkcreg.optimization import Progress
 from torchkcreg.scene import Scene
 
 from .config import Stage
-from .optimizer import Progress
 
 
 class TrainerState(Protocol):

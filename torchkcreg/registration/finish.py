@@ -9,11 +9,11 @@ from typing import Any
 from torchkcreg.scene import RegistrationData, Scene
 from torchkcreg.similarity import GradientCorrelation, GradientDifference
 
-from .basins import Rival
 from .config import RegistrationConfig, Stage
+from .diagnosis import diagnose
 from .result import RegisteredImplant, RegistrationResult
 from .stage_run import StageRun, Terms, changed, similarities
-from .verdict import diagnose, judge
+from .verdict import Rival, judge
 
 _COARSE_BIN = 2  # an expected error needs no finer pixels
 

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import transform_points, vector_from_rotation
-from torchkcreg.scene import Assembly, RegistrationData, Scene
+from torchkcreg.scene import RegistrationData, Scene
 from torchkcreg.similarity import GradientCorrelation, GradientDifference
 
 from .config import RegistrationConfig, Stage
-from .stage_run import data_with_background
+from .prepared import data_with_background
 
 _PIXEL_MM = 1.5  # nothing finer is needed to see that a stage went astray
 _LOST = 1.25  # times what was unexplained before: a stage sees other pixels than its judge
@@ -22,7 +22,6 @@ _MARGIN_MM = 12.0
 _LARGEST_STRAIN = 0.02  # root mean square; metal yields at a tenth of it
 _LARGEST_TURN_DEG = 60.0
 _FURTHEST = 1.5  # lengths of the implant
-_NODES_PITCH_MM = 2.0
 
 
 class Guard:
@@ -82,16 +81,6 @@ def misfit(scene: Scene, data: RegistrationData, config: RegistrationConfig, bin
     return 1 - float(make(view.images.line_integrals, view.images.mask)(scene(view)).mean())
 
 
-@torch.no_grad()
-def rms_strain(assembly: Assembly) -> float:
-    """Root mean square of the strain in an implant."""
-    cloud = assembly.implant.coarsened_to(_NODES_PITCH_MM)
-    gradients = assembly.deformation.jacobian(cloud.points.double())
-    strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(gradients))
-    share = (cloud.volumes / cloud.volumes.sum()).double()
-    return float((strain.square().sum((-2, -1)) * share).sum().sqrt())
-
-
 def implausible(scene: Scene, starts: list[Tensor]) -> str | None:
     """Why a scene cannot be one whose implants began at these poses (4, 4); None if it can."""
     values = [*scene.parameters(), *(a.implant_to_world for a in scene)]
@@ -106,6 +95,6 @@ def implausible(scene: Scene, starts: list[Tensor]) -> str | None:
         turn = math.degrees(float(vector_from_rotation(turned).norm()))
         if shift > _FURTHEST * extent or turn > _LARGEST_TURN_DEG:
             return f"the {assembly.name} moved by {shift:.0f} mm and {turn:.0f} degrees"
-        if not (strain := rms_strain(assembly)) <= _LARGEST_STRAIN:
+        if not (strain := assembly.rms_strain()) <= _LARGEST_STRAIN:
             return f"the {assembly.name} is strained by {100 * strain:.1f} %, far beyond what metal bears"
     return None

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import Deformation, FreeFormDeformation, default_grid
+from torchkcreg.deformation import Deformation, FreeFormDeformation
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
+from torchkcreg.optimization import OptimizerFactory
 from torchkcreg.physics import (
     IdentityIntensity,
     IntensityModel,
@@ -19,11 +20,11 @@ from torchkcreg.physics import (
     tungsten_spectrum,
 )
 from torchkcreg.scene import Assembly, RegistrationData, Scene
+from torchkcreg.splines import default_grid
 
 from .callbacks import Callback
 from .config import RegistrationConfig
 from .objective import Penalty, SimilarityFactory
-from .optimizers import OptimizerFactory
 from .result import RegistrationResult
 from .stage_run import Step, Terms
 from .trainer import Trainer

@@ -8,16 +8,14 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from torchkcreg.scene import Moves, RegistrationData, Scene, View, with_background
+from torchkcreg.optimization import OPTIMIZERS, Optimizer, OptimizerFactory, Progress, iterate
+from torchkcreg.scene import Moves, RegistrationData, Scene, View
 from torchkcreg.similarity import GradientCorrelation, GradientDifference
 
-from .basins import Rival
 from .config import RegistrationConfig, Stage
 from .objective import Objective, Penalty, SimilarityFactory
-from .optimizer import Optimizer, Progress, iterate
-from .optimizers import OPTIMIZERS, OptimizerFactory
-
-_BACKGROUND_PIXELS = 4.0  # a finer background takes over the edges that a stage sees
+from .prepared import data_with_background
+from .verdict import Rival
 
 
 @dataclass(frozen=True)
@@ -155,21 +153,6 @@ class StageRun:
             prior_weight=self.config.prior_weight,
         )
         return Objective(self.scene, view, moves, self.similarity(), penalties=self.terms.penalties)
-
-
-def data_with_background(
-    scene: Scene, data: RegistrationData, config: RegistrationConfig, bin: int
-) -> RegistrationData:
-    """The data with the background that goes with the scene, no finer than pixels binned so can tell."""
-    pixel = data.geometry.pixel_spacing[1]
-    return with_background(scene, data, max(config.background_mm, _BACKGROUND_PIXELS * bin * pixel))
-
-
-def with_scatter_shapes(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
-    """The data with the shapes of the scatter, where the intensity model has scatter."""
-    if not scene.intensity.has_background or data.scatter_shapes is not None:
-        return data
-    return data.with_scatter_shapes(config.scatter_mm)
 
 
 @torch.no_grad()

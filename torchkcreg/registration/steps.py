@@ -11,10 +11,11 @@ import torch
 
 from torchkcreg.scene import Assembly
 
-from .basins import Rival, places
+from .basins import places
 from .config import Stage
 from .screws import find_screws, of_best_metal, screws_by_metal
 from .stage_run import StageRun, Step
+from .verdict import Rival
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
 _LOOKS = ("find_screws", "choose_screws")

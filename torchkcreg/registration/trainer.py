@@ -7,18 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from torchkcreg.optimization import OPTIMIZERS, Progress
 from torchkcreg.scene import RegistrationData, Scene
 
-from .basins import Rival
 from .callbacks import Callback
 from .config import RegistrationConfig, Stage
 from .finish import finished
 from .guard import Guard
-from .optimizer import Progress
-from .optimizers import OPTIMIZERS
+from .prepared import with_scatter_shapes
 from .result import RegistrationResult
-from .stage_run import StageRun, Step, Terms, with_scatter_shapes
+from .stage_run import StageRun, Step, Terms
 from .steps import AFTER, BEFORE, CHANGE_SCENE
+from .verdict import Rival
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
-
-import torch
-
-from torchkcreg.scene import Assembly
-
-from .basins import Rival
-from .guard import rms_strain
-from .objective import Objective
-from .uncertainty import node_deviation
 
 Status = Literal["ok", "doubtful", "failed"]
 
@@ -25,8 +15,21 @@ _DEVIATION_FOUND_MM = 0.025  # with screws that nobody told of: their metal and 
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.0035  # root mean square strain
 _APART_MM, _ALIKE = 2.0, 1.2  # another place, and how much more it leaves unexplained
-_AT_BOUND = 0.01  # of a parameter's range
-_NODES_PITCH_MM = 2.0
+
+
+@dataclass(frozen=True)
+class Rival:
+    """The second best of the places that were tried.
+
+    Attributes:
+        distance_mm: Root mean square distance of the implants' nodes there from where they fit best.
+        misfit: What is left unexplained of the images there.
+        best_misfit: What is left where they fit best.
+    """
+
+    distance_mm: float
+    misfit: float
+    best_misfit: float
 
 
 @dataclass(frozen=True)
@@ -116,56 +119,3 @@ def _doubts(found: Diagnostics) -> list[str]:
     # That the first stage, on coarse pixels, does not improve on a good start says nothing.
     reasons += [f"stage {stage} was undone: {why}" for stage, why in found.undone.items() if stage != "1"]
     return reasons
-
-
-@torch.no_grad()
-def seen_shares(assembly: Assembly, objective: Objective) -> list[float]:
-    """Share of an implant's volume that projects on pixels that count, a view."""
-    volumes, data = assembly.implant.coarsened(4).volumes, objective.images
-    uv, depth = data.geometry.project(assembly.nodes(4))
-    rows, cols = data.geometry.det_shape
-    column, row = uv.round().long().unbind(-1)
-    inside = (column >= 0) & (column < cols) & (row >= 0) & (row < rows) & (depth > 0)
-    index = row.clamp(0, rows - 1) * cols + column.clamp(0, cols - 1)
-    counts = inside & data.mask.flatten(1).gather(1, index)
-    return (counts * volumes).sum(-1).div(volumes.sum()).tolist()
-
-
-@torch.no_grad()
-def diagnose(
-    objective: Objective,
-    gc: list[float],
-    *,
-    converged: bool,
-    undone: Mapping[str, str],
-    rival: Rival | None,
-) -> Diagnostics:
-    """What is measured of a scene at the end of its registration; of several implants, the worst.
-
-    Args:
-        objective: Of the last stage there.
-        gc: Gradient correlation of each view.
-        converged: Whether the last stage ended before its iterations did.
-        undone: Number of each stage that was undone, from 1 on, and why.
-        rival: Where the implants fitted second best, if several places were tried.
-    """
-    rest, scene = objective.at_rest, objective.scene
-    seen = [seen_shares(assembly, objective) for assembly in scene]
-    return Diagnostics(
-        gc=gc,
-        misfit=1 - float(objective.similarities(rest).mean()),
-        node_std_mm=node_deviation(objective, rest[0]),
-        seen=[min(shares) for shares in zip(*seen, strict=True)],
-        strain=max(rms_strain(assembly) for assembly in scene),
-        folds=any(_folds(assembly) for assembly in scene),
-        converged=converged,
-        at_bounds=objective.moves.at_bounds(_AT_BOUND),
-        undone=dict(undone),
-        rival=rival,
-        screws_found=sum(len(assembly.found) for assembly in scene),
-    )
-
-
-def _folds(assembly: Assembly) -> bool:
-    points = assembly.implant.coarsened_to(_NODES_PITCH_MM).points.double()
-    return bool((assembly.deformation.jacobian_determinant(points) <= 0).any())

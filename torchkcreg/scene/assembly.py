@@ -17,6 +17,7 @@ from torchkcreg.precision import ExactModule
 from .state import Placement
 
 _MOST_FOLLOWED = 200
+_NODES_PITCH_MM = 2.0  # strain is smooth
 
 
 class Assembly(ExactModule):
@@ -127,6 +128,15 @@ class Assembly(ExactModule):
         """Rigid motion (4, 4) of each component in the implant's frame."""
         turns = rotation_about(self.heads, self.tilts)
         return {c.name: self.motion_at(c.head) @ t for c, t in zip(self.components, turns, strict=True)}
+
+    @torch.no_grad()
+    def rms_strain(self) -> float:
+        """Root mean square of the strain in the implant."""
+        cloud = self.implant.coarsened_to(_NODES_PITCH_MM)
+        gradients = self.deformation.jacobian(cloud.points.double())
+        strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(gradients))
+        share = (cloud.volumes / cloud.volumes.sum()).double()
+        return float((strain.square().sum((-2, -1)) * share).sum().sqrt())
 
     def kept(self) -> dict[str, Any]:
         """A copy of what a registration changes, as tensors and plain types, for :meth:`restore` and checkpoints."""

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation.bspline import bspline_pieces
-from torchkcreg.deformation.grid import ControlPointGrid
 from torchkcreg.differentiable import one_by_one
+from torchkcreg.splines.bspline import bspline_pieces
+from torchkcreg.splines.grid import ControlPointGrid
 
 _POINTS_PER_BLOCK = 1024  # (64, 1024) weights stay in a core's cache
 _Orders = tuple[int, int, int]

@@ -9,14 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .config import Stage
-from .optimizer import Optimizer, Problem
+from .optimizer import Optimizer, Options, Problem
 
 
 class CMAES(Optimizer):
     """Covariance matrix adaptation evolution strategy (library ``cma``); a whole generation is one batch."""
 
-    def __init__(self, problem: Problem, stage: Stage, seed: int) -> None:
+    def __init__(self, problem: Problem, stage: Options, seed: int) -> None:
         import cma  # late: it brings a plotting library along, and few registrations need it
 
         super().__init__(problem, stage, seed)

@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .config import Stage
-from .optimizer import Optimizer, Problem
+from .optimizer import Optimizer, Options, Problem
 
 
 class Adam(Optimizer):
@@ -17,7 +16,7 @@ class Adam(Optimizer):
 
     uses_losses = False
 
-    def __init__(self, problem: Problem, stage: Stage, seed: int) -> None:
+    def __init__(self, problem: Problem, stage: Options, seed: int) -> None:
         super().__init__(problem, stage, seed)
         self._parameters = self._zeros().requires_grad_(True)
         self._best, self._loss = self._parameters.detach().clone(), math.inf

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from .config import Stage
-from .optimizer import Optimizer, Problem
+from .optimizer import Optimizer, Options, Problem
 
 _NEGLIGIBLE = 2e-5  # of the loss
 
@@ -22,7 +21,7 @@ class GaussNewton(Optimizer):
 
     _KEPT: ClassVar[tuple[str, ...]] = ("_parameters", "_loss", "_gradient", "_curvature", "_fresh", "_damping")
 
-    def __init__(self, problem: Problem, stage: Stage, seed: int) -> None:
+    def __init__(self, problem: Problem, stage: Options, seed: int) -> None:
         super().__init__(problem, stage, seed)
         self._parameters = self._zeros()
         self._curvature: Tensor | None = None

@@ -4,8 +4,8 @@ import pytest
 import torch
 from scipy.interpolate import BSpline
 
-from torchkcreg.deformation import cubic_bspline_derivatives, cubic_bspline_weights
-from torchkcreg.deformation.bspline import bspline_pieces
+from torchkcreg.splines import cubic_bspline_derivatives, cubic_bspline_weights
+from torchkcreg.splines.bspline import bspline_pieces
 
 ETA = torch.linspace(0, 1, 41, dtype=torch.float64)
 

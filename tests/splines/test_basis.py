@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from torchkcreg.deformation import ControlPointGrid, cubic_bspline_weights
-from torchkcreg.deformation.basis import _POINTS_PER_BLOCK, SplineBasis
+from torchkcreg.splines import ControlPointGrid, cubic_bspline_weights
+from torchkcreg.splines.basis import _POINTS_PER_BLOCK, SplineBasis
 
 GRID = ControlPointGrid((5, 6, 7), (2.0, 3.0, 4.0), torch.eye(4))
 

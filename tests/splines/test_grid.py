@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from torchkcreg.deformation import ControlPointGrid, default_grid
 from torchkcreg.geometry import rigid_matrix, transform_points
+from torchkcreg.splines import ControlPointGrid, default_grid
 
 
 def box(length, width, thickness, step=1.0):

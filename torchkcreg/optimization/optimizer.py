@@ -10,7 +10,28 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from .config import Stage
+
+class Options(Protocol):
+    """How long an optimiser may walk, and how far at a time; a stage of a registration is one.
+
+    Attributes:
+        iterations: At most so many.
+        tolerance: It ends when an iteration moves the implant by less, mm.
+        step_mm: Its first, or longest, step.
+        population: Candidates of a generation, where it has generations.
+    """
+
+    @property
+    def iterations(self) -> int: ...
+
+    @property
+    def tolerance(self) -> float: ...
+
+    @property
+    def step_mm(self) -> float: ...
+
+    @property
+    def population(self) -> int: ...
 
 
 class Problem(Protocol):
@@ -58,7 +79,7 @@ class Optimizer(ABC):
 
     uses_losses: ClassVar[bool] = True
 
-    def __init__(self, problem: Problem, stage: Stage, seed: int) -> None:
+    def __init__(self, problem: Problem, stage: Options, seed: int) -> None:
         self.problem, self.stage, self.seed = problem, stage, seed
         self.progress = Progress(0, math.inf, math.inf)
         self.done = self.converged = False

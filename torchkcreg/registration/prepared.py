@@ -1,0 +1,24 @@
+"""What is estimated about the images before they are compared: background and scatter."""
+
+from __future__ import annotations
+
+from torchkcreg.scene import RegistrationData, Scene, with_background
+
+from .config import RegistrationConfig
+
+_BACKGROUND_PIXELS = 4.0  # a finer background takes over the edges that a stage sees
+
+
+def data_with_background(
+    scene: Scene, data: RegistrationData, config: RegistrationConfig, bin: int
+) -> RegistrationData:
+    """The data with the background that goes with the scene, no finer than pixels binned so can tell."""
+    pixel = data.geometry.pixel_spacing[1]
+    return with_background(scene, data, max(config.background_mm, _BACKGROUND_PIXELS * bin * pixel))
+
+
+def with_scatter_shapes(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
+    """The data with the shapes of the scatter, where the intensity model has scatter."""
+    if not scene.intensity.has_background or data.scatter_shapes is not None:
+        return data
+    return data.with_scatter_shapes(config.scatter_mm)
