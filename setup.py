@@ -12,7 +12,7 @@ from setuptools import setup
 from torch.utils.cpp_extension import BuildExtension, CppExtension
 
 PACKAGE = "torchkcreg"
-BUILD = runpy.run_path(str(Path(__file__).parent / PACKAGE / "projector" / "extension.py"))
+BUILD = runpy.run_path(str(Path(__file__).parent / PACKAGE / "kernels" / "extension.py"))
 
 
 class OptionalBuildExtension(BuildExtension):

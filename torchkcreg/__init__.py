@@ -48,6 +48,7 @@ _FOLDERS = (
     "implant",
     "io",
     "physics",
+    "kernels",
     "optimization",
     "projector",
     "reconstruction",

@@ -233,7 +233,7 @@ POINTS = torch.zeros(4, 3)
         ({"footprint": cell_footprint(POINTS, CELL, camera(0))}, "either cell or footprint"),
         ({"cell": None, "footprint": cell_footprint(POINTS, CELL, camera(0), block_size=2)}, "3 views and 1 blocks"),
         ({"backend": "fast"}, "backend must be one of auto, cpp, torch"),
-        ({"backend": "triton"}, '"triton" is not available'),
+        ({"backend": "triton"}, "backend must be one of auto, cpp, torch, got 'triton'"),
     ],
 )
 def test_wrong_input_is_named(change, message):

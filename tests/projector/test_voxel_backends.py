@@ -5,8 +5,8 @@ import torch
 from voxel_scenes import DET_SHAPE, GRIDS, KINDS, straight_grid, views
 
 from torchkcreg.geometry import VolumeGrid
+from torchkcreg.kernels import unavailable_reason
 from torchkcreg.projector import backproject, backproject_weighted, project_volume
-from torchkcreg.projector.backends import load_operators
 from torchkcreg.projector.voxels import _rays
 
 BACKENDS = ("cpp", "torch")
@@ -14,7 +14,7 @@ BACKENDS = ("cpp", "torch")
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_kernels():
-    if load_operators() is not None:
+    if unavailable_reason() is not None:
         pytest.skip("the C++ kernels can be neither loaded nor compiled here")
 
 

@@ -12,8 +12,7 @@ from torchkcreg.deformation import FreeFormDeformation
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.implant import volume
 from torchkcreg.io import RunFolder, geometry_from_dict, read_json, read_mesh, read_projections, versions
-from torchkcreg.projector.extension import PACKAGE
-from torchkcreg.projector.ops import choose_backend, load_operators
+from torchkcreg.kernels import PACKAGE, choose_backend, unavailable_reason
 from torchkcreg.registration import RegisteredImplant
 
 _MESHES = (".stl", ".obj", ".ply", ".off", ".3mf")
@@ -23,12 +22,12 @@ _IMAGES = (".npz", ".npy", ".mha", ".mhd", ".nrrd", ".nii", ".gz", ".tif", ".tif
 def describe_installation() -> str:
     """Versions, threads and the projector's backend with the reason for it, a line each."""
     lines = [f"{name} {version}" for name, version in versions().items()]
-    backend = choose_backend(torch.empty(0), "auto")
+    backend = choose_backend(torch.empty(0), "auto").name
     if backend == "cpp":
         built = any(PACKAGE.glob("_C*.so")) or any(PACKAGE.glob("_C*.pyd"))
         why = "C++ kernels built with the package" if built else "C++ kernels compiled at first use"
     else:
-        why = f"the readable reference, slow; no C++ kernels: {load_operators()}"
+        why = f"the readable reference, slow; no C++ kernels: {unavailable_reason()}"
     return "\n".join([*lines, f"projector backend {backend} ({why})"])
 
 

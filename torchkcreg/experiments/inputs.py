@@ -23,8 +23,8 @@ from torchkcreg.io import (
     read_projections,
     read_spectrum,
 )
+from torchkcreg.kernels import choose_backend
 from torchkcreg.physics import Spectrum, material
-from torchkcreg.projector.ops import choose_backend
 from torchkcreg.registration import RegistrationConfig, RegistrationData
 
 _FEWEST_NODES_ALONG = 4

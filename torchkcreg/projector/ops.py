@@ -1,7 +1,4 @@
-"""The point-cloud DRR as a torch operator: fake kernels and derivatives.
-
-Schemas are in ``csrc/ops.cpp``, kernels in ``csrc/cpu``; see `backends` for when they are loaded.
-"""
+"""The point-cloud DRR as an operator with its derivatives; kernels are in ``csrc/cpu/point_drr.cpp``."""
 
 from __future__ import annotations
 
@@ -12,11 +9,9 @@ import torch
 from torch import Tensor
 
 from torchkcreg.differentiable import differentiable
+from torchkcreg.kernels import Operator, choose_backend
 
-from .backends import choose_backend, load_operators
 from .reference import splat_points
-
-__all__ = ["choose_backend", "load_operators", "point_drr"]
 
 
 def point_drr(
@@ -34,12 +29,12 @@ def point_drr(
 
     Raises:
         ValueError: for a backend that does not exist or does not serve the device of the points.
-        OSError: for ``backend="cpp"`` where the kernels are neither built nor can be compiled.
+        OSError: for a backend whose kernels cannot be had.
     """
     kernel = _PointDrr(table, block_size, rows, cols)
-    if choose_backend(points, backend) == "cpp":
-        return differentiable(kernel, points, volumes, matrices)
-    return kernel.reference(points, volumes, matrices)
+    if choose_backend(points, backend, operator=POINT_DRR.name).is_reference:
+        return kernel.reference(points, volumes, matrices)
+    return differentiable(kernel, points, volumes, matrices)
 
 
 @dataclass(frozen=True)
@@ -52,31 +47,46 @@ class _PointDrr:
     cols: int
 
     def forward(self, points: Tensor, volumes: Tensor, matrices: Tensor) -> Tensor:
-        return torch.ops.torchkcreg.point_drr(
-            points, volumes, matrices, self.table, self.block_size, self.rows, self.cols
-        )
+        return POINT_DRR.dispatched(points, volumes, matrices, self.table, self.block_size, self.rows, self.cols)
 
     def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
-        found = torch.ops.torchkcreg.point_drr_backward(gradient, *inputs, self.table, self.block_size, *needed[1:])
+        found = POINT_DRR_BACKWARD.dispatched(gradient, *inputs, self.table, self.block_size, *needed[1:])
         return [g if need else None for g, need in zip(found, needed)]
 
     def reference(self, points: Tensor, volumes: Tensor, matrices: Tensor) -> Tensor:
         return splat_points(points, volumes, matrices, self.table, self.block_size, self.rows, self.cols)
 
 
-def register() -> None:
-    """Fake kernels of the compiled operator."""
-    torch.library.register_fake("torchkcreg::point_drr", _fake_forward)
-    torch.library.register_fake("torchkcreg::point_drr_backward", _fake_backward)
+def _splat_gradients(
+    grad: Tensor,
+    points: Tensor,
+    volumes: Tensor,
+    matrices: Tensor,
+    table: Tensor,
+    block_size: int,
+    need_volumes: bool,
+    need_matrices: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of `splat_points` by autograd; one that is not needed comes back empty."""
+    rows, cols = grad.shape[-2:]
+    here, there, views = (t.detach().requires_grad_(True) for t in (points, volumes, matrices))
+    with torch.enable_grad():
+        images = splat_points(here, there, views, table, block_size, rows, cols)
+    to_points, to_volumes, to_matrices = torch.autograd.grad(images, (here, there, views), grad)
+    return (
+        to_points,
+        to_volumes if need_volumes else to_volumes.new_empty(0),
+        to_matrices if need_matrices else to_matrices.new_empty(0),
+    )
 
 
-def _fake_forward(
+def _fake_images(
     points: Tensor, volumes: Tensor, matrices: Tensor, table: Tensor, block_size: int, rows: int, cols: int
 ) -> Tensor:
     return points.new_empty(points.shape[0], matrices.shape[0], rows, cols)
 
 
-def _fake_backward(
+def _fake_gradients(
     grad: Tensor,
     points: Tensor,
     volumes: Tensor,
@@ -91,3 +101,18 @@ def _fake_backward(
         volumes.new_empty(volumes.shape if need_volumes else (0,)),
         matrices.new_empty(matrices.shape if need_matrices else (0,)),
     )
+
+
+# points (B, N, 3), volumes (N,), matrices (V, 3, 4), table (V, blocks, R + 1, R + 1, T, T) -> (B, V, rows, cols)
+POINT_DRR = Operator(
+    "point_drr(Tensor points, Tensor volumes, Tensor matrices, Tensor table, int block_size, int rows, int cols) "
+    "-> Tensor",
+    reference=splat_points,
+    fake=_fake_images,
+)
+POINT_DRR_BACKWARD = Operator(
+    "point_drr_backward(Tensor grad, Tensor points, Tensor volumes, Tensor matrices, Tensor table, int block_size, "
+    "bool need_volumes, bool need_matrices) -> (Tensor, Tensor, Tensor)",
+    reference=_splat_gradients,
+    fake=_fake_gradients,
+)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchkcreg.kernels import choose_backend
 from torchkcreg.precision import full_precision
 
 from .footprint import Footprint, cell_footprint
-from .ops import choose_backend, point_drr
+from .ops import POINT_DRR, point_drr
 
 
 @full_precision
@@ -61,7 +62,7 @@ def project_points(
     0.5
     """
     _check_points(points, volumes, projection_matrices, det_shape)
-    choose_backend(points, backend)  # a wrong name should not wait for the footprint
+    choose_backend(points, backend, operator=POINT_DRR.name)  # a wrong name should not wait for the footprint
     if footprint is None and cell is not None:
         footprint = cell_footprint(points, cell, projection_matrices)
     elif footprint is None or cell is not None:

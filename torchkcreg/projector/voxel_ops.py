@@ -1,18 +1,14 @@
-"""The voxel projector as torch operators: fake kernels, derivatives, and the choice of the backend.
-
-Schemas are in ``csrc/ops.cpp``, kernels in ``csrc/cpu``; see `backends` for when they are loaded.
-"""
+"""The voxel projector as operators with their derivatives; kernels are in ``csrc/cpu/voxel_*.cpp``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from torchkcreg.differentiable import linear
+from torchkcreg.kernels import Operator, kernel
 
-from .backends import choose_backend
 from .voxel_reference import backproject_by_planes, project_by_planes
 from .voxel_weighted_reference import backproject_by_voxels, spread_over_images
 
@@ -22,8 +18,7 @@ _Map = Callable[[Tensor], Tensor]
 def voxel_project(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols: int, *, backend: str) -> Tensor:
     """Path integrals (B, V, rows, cols) of volume (B, D, H, W); see `voxel_reference` for rays and spacing."""
     depth, height, width = volume.shape[-3:]
-    shape = (depth, height, width)
-    project, backproject = _projector(rays, spacing, (rows, cols), shape, choose_backend(volume, backend))
+    project, backproject = _projector(volume, rays, spacing, (rows, cols), (depth, height, width), backend)
     return linear(volume, project, backproject)
 
 
@@ -32,7 +27,7 @@ def voxel_backproject(
 ) -> Tensor:
     """The adjoint of `voxel_project`: images (B, V, rows, cols) into (B, D, H, W)."""
     rows, cols = images.shape[-2:]
-    project, backproject = _projector(rays, spacing, (rows, cols), shape, choose_backend(images, backend))
+    project, backproject = _projector(images, rays, spacing, (rows, cols), shape, backend)
     return linear(images, backproject, project)
 
 
@@ -41,50 +36,41 @@ def voxel_backproject_weighted(
 ) -> Tensor:
     """Sum over views of the image over the squared depth, (B, D, H, W); see `voxel_weighted_reference`."""
     rows, cols = images.shape[-2:]
-    compiled = choose_backend(images, backend) == "cpp"
-
-    def apply(data: Tensor) -> Tensor:
-        if compiled:
-            return torch.ops.torchkcreg.voxel_backproject_weighted(data, matrices, *shape)
-        return backproject_by_voxels(data, matrices, shape)
-
+    apply = kernel(VOXEL_BACKPROJECT_WEIGHTED, images, backend)
     # Nothing iterates with this gradient, so it has no kernel of its own.
-    return linear(images, apply, lambda volume: spread_over_images(volume, matrices, rows, cols))
-
-
-def _projector(
-    rays: Tensor, spacing: Tensor, det_shape: tuple[int, int], shape: tuple[int, int, int], backend: str
-) -> tuple[_Map, _Map]:
-    """The projector and its adjoint, each other's gradient."""
-    if backend == "cpp":
-        kernels = torch.ops.torchkcreg
-        return (
-            lambda volume: kernels.voxel_project(volume, rays, spacing, *det_shape),
-            lambda images: kernels.voxel_backproject(images, rays, spacing, *shape),
-        )
-    return (
-        lambda volume: project_by_planes(volume, rays, spacing, *det_shape),
-        lambda images: backproject_by_planes(images, rays, spacing, shape),
+    return linear(
+        images,
+        lambda data: apply(data, matrices, *shape),
+        lambda volume: spread_over_images(volume, matrices, rows, cols),
     )
 
 
-def register() -> None:
-    """Fake kernels of the compiled operators."""
-    for name, fake in (
-        ("voxel_project", _fake_images),
-        ("voxel_backproject", _fake_volume),
-        ("voxel_backproject_weighted", _fake_weighted),
-    ):
-        torch.library.register_fake(f"torchkcreg::{name}", fake)
+def _projector(
+    data: Tensor, rays: Tensor, spacing: Tensor, det_shape: tuple[int, int], shape: tuple[int, int, int], backend: str
+) -> tuple[_Map, _Map]:
+    """The projector and its adjoint, each other's gradient."""
+    project, backproject = (kernel(op, data, backend) for op in (VOXEL_PROJECT, VOXEL_BACKPROJECT))
+    return (
+        lambda volume: project(volume, rays, spacing, *det_shape),
+        lambda images: backproject(images, rays, spacing, *shape),
+    )
 
 
-def _fake_images(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols: int) -> Tensor:
-    return volume.new_empty(volume.shape[0], rays.shape[0], rows, cols)
-
-
-def _fake_volume(images: Tensor, rays: Tensor, spacing: Tensor, depth: int, height: int, width: int) -> Tensor:
-    return images.new_empty(images.shape[0], depth, height, width)
-
-
-def _fake_weighted(images: Tensor, matrices: Tensor, depth: int, height: int, width: int) -> Tensor:
-    return images.new_empty(images.shape[0], depth, height, width)
+# volume (B, D, H, W), rays (V, 3, 4) and spacing (3,) in float64 -> (B, V, rows, cols)
+VOXEL_PROJECT = Operator(
+    "voxel_project(Tensor volume, Tensor rays, Tensor spacing, int rows, int cols) -> Tensor",
+    reference=project_by_planes,
+    fake=lambda volume, rays, spacing, rows, cols: volume.new_empty(len(volume), len(rays), rows, cols),
+)
+# Its adjoint: images (B, V, rows, cols) -> (B, depth, height, width)
+VOXEL_BACKPROJECT = Operator(
+    "voxel_backproject(Tensor images, Tensor rays, Tensor spacing, int depth, int height, int width) -> Tensor",
+    reference=lambda images, rays, spacing, *shape: backproject_by_planes(images, rays, spacing, shape),
+    fake=lambda images, rays, spacing, *shape: images.new_empty(len(images), *shape),
+)
+# images (B, V, rows, cols), matrices (V, 3, 4) in float64 -> (B, depth, height, width)
+VOXEL_BACKPROJECT_WEIGHTED = Operator(
+    "voxel_backproject_weighted(Tensor images, Tensor matrices, int depth, int height, int width) -> Tensor",
+    reference=lambda images, matrices, *shape: backproject_by_voxels(images, matrices, shape),
+    fake=lambda images, matrices, *shape: images.new_empty(len(images), *shape),
+)

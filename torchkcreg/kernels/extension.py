@@ -12,7 +12,6 @@ import torch
 
 PACKAGE = Path(__file__).resolve().parent.parent
 SOURCES = (
-    "csrc/ops.cpp",
     "csrc/cpu/point_drr.cpp",
     "csrc/cpu/voxel_project.cpp",
     "csrc/cpu/voxel_backproject.cpp",

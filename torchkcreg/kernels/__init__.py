@@ -1,0 +1,18 @@
+"""Operators of torch's dispatcher (`torch.ops.torchkcreg`) and the backends that serve them: a readable reference in
+plain torch for any device, and C++ for CPUs. The C++ sources are in ``csrc``, the derivatives in `differentiable`."""
+
+from .backend import Backend
+from .backends import BACKENDS, backend_names, choose_backend, kernel
+from .extension import PACKAGE, unavailable_reason
+from .operator import Operator
+
+__all__ = [
+    "BACKENDS",
+    "PACKAGE",
+    "Backend",
+    "Operator",
+    "backend_names",
+    "choose_backend",
+    "kernel",
+    "unavailable_reason",
+]

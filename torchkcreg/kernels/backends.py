@@ -1,0 +1,70 @@
+"""The backends there are, and which one serves a request."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+from torch import Tensor
+
+from .backend import Backend
+from .extension import unavailable_reason
+from .operator import Operator
+
+# The first that serves a request is what "auto" takes.
+BACKENDS: tuple[Backend, ...] = (
+    Backend("cpp", frozenset({"cpu"}), unavailable_reason),
+    Backend("torch", None, lambda: None, is_reference=True),
+)
+
+
+def backend_names() -> tuple[str, ...]:
+    """What a user may ask for."""
+    return ("auto", *(backend.name for backend in BACKENDS))
+
+
+def choose_backend(data: Tensor, name: str = "auto", *, operator: str | None = None) -> Backend:
+    """The backend that serves a request on the device of the data.
+
+    Where "auto" ends at the slow reference on a device that could have kernels, a warning says so, once.
+
+    Args:
+        data: What is computed with.
+        name: "auto", or one of the backends.
+        operator: Name of the operator; any if None.
+
+    Raises:
+        ValueError: for a backend that does not exist, or does not serve the device of the data or the operator.
+        OSError: for one that is asked for by name and whose kernels cannot be had.
+    """
+    if name not in backend_names():
+        raise ValueError(f"backend must be one of {', '.join(backend_names())}, got {name!r}")
+    device = data.device.type
+    asked = [backend for backend in BACKENDS if name in ("auto", backend.name)]
+    able = [backend for backend in asked if backend.serves(device, operator)]
+    if not able:
+        only = " or ".join("the CPU" if kind == "cpu" else kind for kind in sorted(asked[0].devices or ()))
+        raise ValueError(f'backend "{name}" needs tensors on {only}, got {data.device}')
+    for backend in able:
+        reason = backend.unavailable()
+        if reason is None:
+            if name == "auto" and backend.is_reference and device not in ("cpu", "meta"):
+                _warn_of_reference(device)
+            return backend
+    raise OSError(f'the kernels of backend "{name}" are not available: {reason}')
+
+
+def kernel(operator: Operator, data: Tensor, backend: str) -> Callable[..., Any]:
+    """What computes an operator for a request; no derivative may be asked of it but of the reference."""
+    chosen = choose_backend(data, backend, operator=operator.name)
+    return operator.reference if chosen.is_reference else operator.dispatched
+
+
+@functools.cache
+def _warn_of_reference(device: str) -> None:
+    warnings.warn(
+        f"there are no kernels for {device}: torchkcreg runs on its readable reference there, many times slower",
+        stacklevel=4,
+    )
