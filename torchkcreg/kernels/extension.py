@@ -13,6 +13,7 @@ import torch
 PACKAGE = Path(__file__).resolve().parent.parent
 SOURCES = (
     "csrc/cpu/point_drr.cpp",
+    "csrc/cpu/transmission.cpp",
     "csrc/cpu/voxel_project.cpp",
     "csrc/cpu/voxel_backproject.cpp",
     "csrc/cpu/voxel_backproject_weighted.cpp",

@@ -1,5 +1,6 @@
 """Materials, spectra, intensity models and the detector: what turns path lengths in mm into measured line integrals."""
 
+from torchkcreg.physics.beam import Beam
 from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
 from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
 from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission
@@ -7,10 +8,11 @@ from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
 from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
 from torchkcreg.physics.scatter import scatter_shapes, scattered_signal
 from torchkcreg.physics.spectra import Spectrum, tungsten_spectrum
-from torchkcreg.physics.transmission import polyenergetic_line_integrals
+from torchkcreg.physics.transmission import transmission
 
 __all__ = [
     "COUNT_FLOOR",
+    "Beam",
     "FreeParameter",
     "IdentityIntensity",
     "IntensityModel",
@@ -24,8 +26,8 @@ __all__ = [
     "material",
     "material_names",
     "mixture",
-    "polyenergetic_line_integrals",
     "scatter_shapes",
     "scattered_signal",
+    "transmission",
     "tungsten_spectrum",
 ]

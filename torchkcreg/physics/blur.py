@@ -63,29 +63,6 @@ def convolve_by(images: Tensor, kernel: Tensor, dim: int) -> Tensor:
     return result
 
 
-def convolve_adjoint(images: Tensor, kernel: list[float], dim: int) -> Tensor:
-    """The adjoint of `convolve`: `<convolve(x), y> = <x, convolve_adjoint(y)>`."""
-    radius, size = len(kernel) // 2, images.shape[dim]
-    if radius == 0:
-        return images * kernel[0]
-    shape = list(images.shape)
-    shape[dim] += 2 * radius
-    spread = images.new_zeros(shape)
-    for offset, value in enumerate(kernel):
-        spread.narrow(dim, offset, size).add_(images, alpha=value)
-    result = spread.narrow(dim, radius, size).clone()
-    result.narrow(dim, 0, 1).add_(spread.narrow(dim, 0, radius).sum(dim, keepdim=True))
-    result.narrow(dim, size - 1, 1).add_(spread.narrow(dim, radius + size, radius).sum(dim, keepdim=True))
-    return result
-
-
-def kernel_gradient(images: Tensor, upstream: Tensor, radius: int, dim: int) -> list[float]:
-    """Derivative of `<convolve(images, kernel), upstream>` to each value of the kernel."""
-    padded = _repeat_border(images, radius, dim) if radius else images
-    size = images.shape[dim]
-    return [float((padded.narrow(dim, offset, size) * upstream).sum()) for offset in range(2 * radius + 1)]
-
-
 def _repeat_border(images: Tensor, radius: int, dim: int) -> Tensor:
     """Images with `radius` copies of their first and last line along a dimension."""
     sides = (0, 0, radius, radius) if dim == -2 else (radius, radius, 0, 0)

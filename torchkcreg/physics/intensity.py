@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
+from torchkcreg.physics.beam import Beam
 from torchkcreg.physics.blur import gaussian_kernel
 from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
-from torchkcreg.physics.materials import Material, material
+from torchkcreg.physics.materials import Material
 from torchkcreg.physics.scatter import scattered_signal
 from torchkcreg.physics.spectra import Spectrum
-from torchkcreg.physics.transmission import polyenergetic_line_integrals
 from torchkcreg.precision import full_precision
 
 # Standard deviations of where scanners and limbs have these parameters.
@@ -50,7 +51,8 @@ class PolyenergeticTransmission(IntensityModel):
 
     Args:
         materials: The materials, in the order of the path lengths' M.
-        spectrum: The detected spectrum. It is reduced to the fewest energies that transmit alike.
+        spectrum: The detected spectrum, or one for each source by its name. It is reduced to the fewest energies that
+            transmit alike.
         scatter: Scatter s that comes with what passes, in units of the open beam.
         scatter_removed: Scatter r from what is removed; it needs a shape.
         blur_sigma_px: Standard deviation of the system's point spread, pixels.
@@ -63,8 +65,7 @@ class PolyenergeticTransmission(IntensityModel):
     Attributes:
         scatter, scatter_removed, blur_sigma_px, hardness: Scalar parameters, float64, which a fit may move. The
             gradient to `blur_sigma_px` vanishes at zero: start a fit of it from a third of a pixel or more.
-        energies_kev, weights, attenuation: Buffers: the energies kept `(B,)`, their weights `(B,)`, and the materials'
-            attenuation `(M, B)` in 1/mm.
+        beam: Energies kept, their weights and the materials' attenuation, see :class:`Beam`.
 
     Raises:
         ValueError: If there are no materials, or scatter or blur are negative.
@@ -76,15 +77,10 @@ class PolyenergeticTransmission(IntensityModel):
     torch.Size([1, 1, 3])
     """
 
-    energies_kev: Tensor
-    weights: Tensor
-    attenuation: Tensor
-    aluminium: Tensor
-
     def __init__(
         self,
         materials: Sequence[Material],
-        spectrum: Spectrum,
+        spectrum: Spectrum | Mapping[str, Spectrum],
         *,
         scatter: float = 0.0,
         scatter_removed: float = 0.0,
@@ -120,16 +116,16 @@ class PolyenergeticTransmission(IntensityModel):
         for name, value in named.items():
             if not value >= 0:
                 raise ValueError(f"{name} must not be negative, got {value}")
-        kept = spectrum if num_bins is None else spectrum.reduced(materials, num_bins)
         self.material_names = tuple(m.name for m in materials)
         self.scatter = _parameter(scatter)
         self.scatter_removed = _parameter(scatter_removed)
         self.blur_sigma_px = _parameter(blur_sigma_px)
         self.hardness = _parameter(hardness)
-        self.register_buffer("energies_kev", torch.tensor(kept.energies_kev, dtype=torch.float64))
-        self.register_buffer("weights", torch.tensor(kept.weights, dtype=torch.float64))
-        self.register_buffer("attenuation", torch.stack([m.attenuation(kept.energies_kev) for m in materials]))
-        self.register_buffer("aluminium", material("aluminium").attenuation(kept.energies_kev))
+        self.beam = Beam.of(materials, spectrum, num_bins=num_bins)
+
+    def of_sources(self, sources: Sequence[str] | None) -> dict[str, Any]:
+        """The sources, where each has a spectrum of its own."""
+        return {} if self.beam.sources is None else {"sources": sources}
 
     @full_precision
     def forward(
@@ -142,6 +138,7 @@ class PolyenergeticTransmission(IntensityModel):
         hardness: Tensor | None = None,
         pooling: int = 1,
         scatter_shapes: Tensor | None = None,
+        sources: Sequence[str] | None = None,
     ) -> Tensor:
         """Line integrals `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)` in mm.
 
@@ -156,24 +153,24 @@ class PolyenergeticTransmission(IntensityModel):
                 exponential of the average.
             scatter_shapes: How both kinds of scatter are spread over the detector, p and q, of shape
                 (2, V, rows, cols) after pooling. None: p is even, and q is nothing.
+            sources: Names of the views' sources, where each source has a spectrum of its own.
 
         Raises:
             ValueError: If the path lengths' M is not the number of materials, or an override fits no candidate axis, or
                 pooling does not divide the images.
         """
-        _check_path_lengths(path_lengths, len(self.attenuation), pooling)
+        _check_path_lengths(path_lengths, len(self.material_names), pooling)
         leading = path_lengths.shape[:-4]
         # the few numbers a candidate in the module's own precision; the images in theirs
         hardness = _per_candidate("hardness", self.hardness, hardness, leading)
         sigma = _per_candidate("blur_sigma_px", self.blur_sigma_px, blur_sigma_px, leading)
-        weights = torch.softmax(self.weights.log() - hardness[:, None] * self.aluminium, dim=-1)
+        weights = self.beam.hardened(hardness, sources)
         flat = path_lengths.reshape(-1, *path_lengths.shape[-4:])
         levels = self._scatter_levels(scatter, scatter_removed, leading)
         scattered = scattered_signal(levels, scatter_shapes)
-        lines = polyenergetic_line_integrals(
-            flat, self.attenuation, weights, gaussian_kernel(sigma), scattered, pooling
-        )
-        result = lines + torch.log1p(levels[:, 0]).to(lines)[:, None, None, None]
+        passed = self.beam.transmission(flat, weights=weights, kernel=gaussian_kernel(sigma), pooling=pooling)
+        signal = (passed + scattered.to(passed)).clamp_min(torch.finfo(passed.dtype).tiny)  # no NaN, whatever s
+        result = torch.log1p(levels[:, 0]).to(signal)[:, None, None, None] - signal.log()
         return result.reshape(*leading, *result.shape[-3:])
 
     def _scatter_levels(self, passed: Tensor | None, removed: Tensor | None, leading: torch.Size) -> Tensor:
@@ -183,7 +180,7 @@ class PolyenergeticTransmission(IntensityModel):
 
     def extra_repr(self) -> str:
         """Materials and number of energies."""
-        return f"materials={', '.join(self.material_names)}, num_bins={len(self.weights)}"
+        return f"materials={', '.join(self.material_names)}, num_bins={len(self.beam.energies_kev)}"
 
 
 def _parameter(value: float) -> nn.Parameter:

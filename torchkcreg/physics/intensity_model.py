@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -57,3 +58,7 @@ class IntensityModel(nn.Module):
             value = overrides.get(free.attribute, getattr(self, free.attribute).detach()[None])
             found[free.attribute] = value / pixel_px if free.in_pixels else value
         return found
+
+    def of_sources(self, sources: Sequence[str] | None) -> dict[str, Any]:
+        """Keyword arguments of `forward` that depend on the names of the views' sources; none by default."""
+        return {}

@@ -1,4 +1,4 @@
-"""Line integrals that a detector reports behind several materials: one fused operation with its own derivatives."""
+"""What materials let through of a beam of several energies, blurred and averaged over pixels: one fused operation."""
 
 from __future__ import annotations
 
@@ -10,151 +10,132 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from torchkcreg.differentiable import differentiable
-from torchkcreg.physics.blur import convolve, convolve_adjoint, convolve_by, kernel_gradient
+from torchkcreg.kernels import Operator, choose_backend
+from torchkcreg.physics.blur import convolve_by
 
-BLOCK_PIXELS = 65536  # exponentials are taken in blocks that stay in a core's cache
+
+def transmission(
+    path_lengths: Tensor,
+    attenuation: Tensor,
+    weights: Tensor,
+    *,
+    kernel: Tensor | None = None,
+    pooling: int = 1,
+    backend: str = "auto",
+) -> Tensor:
+    """Transmitted share of the beam (K, V, rows / pooling, cols / pooling), by Beer and Lambert's law over energies.
+
+    ``T = pool(blur(sum_e w_e exp(-sum_m mu_me L_m)))``; only images of the size of the result are kept for the
+    gradient, whatever the number of energies.
+
+    Args:
+        path_lengths: L in mm, (K, M, V, rows, cols).
+        attenuation: mu in 1/mm, (M, E).
+        weights: w, shape (E,), or whatever broadcasts to (K, V, E): spectra of views, or of candidates.
+        kernel: One-dimensional blur kernels, (K, odd), applied along rows and columns, the border repeated; none if not
+            given.
+        pooling: Blurred transmissions are averaged over squares of this many pixels a side.
+        backend: "auto", "cpp" or "torch".
+
+    Returns:
+        Differentiable in everything: first gradients by formulas of their own, all other derivatives by those of plain
+        torch, which keep an image for each energy.
+
+    Raises:
+        ValueError: If shapes do not fit.
+
+    >>> water = torch.tensor([[0.02]])
+    >>> transmission(torch.full((1, 1, 1, 1, 1), 50.0), water, torch.ones(1)).flatten()
+    tensor([0.3679])
+    """
+    if path_lengths.dim() != 5 or attenuation.dim() != 2 or path_lengths.shape[1] != len(attenuation):
+        raise ValueError(
+            f"path_lengths must have shape (K, {len(attenuation)}, V, rows, cols), got {tuple(path_lengths.shape)}"
+        )
+    candidates, _, views, rows, cols = path_lengths.shape
+    if pooling < 1 or rows % pooling or cols % pooling:
+        raise ValueError(f"pooling must divide rows and cols, got {pooling} for {rows} x {cols}")
+    shape = (candidates, views, attenuation.shape[1])
+    try:
+        spectra = weights.to(path_lengths).broadcast_to(shape)
+    except RuntimeError as error:
+        raise ValueError(f"weights must broadcast to (K, V, E) = {shape}, got {tuple(weights.shape)}") from error
+    blur = path_lengths.new_ones(candidates, 1) if kernel is None else kernel.to(path_lengths)
+    operation = _Transmission(pooling)
+    inputs = (path_lengths, attenuation.to(path_lengths), spectra, blur.broadcast_to(candidates, blur.shape[-1]))
+    if choose_backend(path_lengths, backend, operator=TRANSMISSION.name).is_reference:
+        return operation.reference(*inputs)
+    return differentiable(operation, *inputs)
 
 
-def polyenergetic_line_integrals(
+@dataclass(frozen=True)
+class _Transmission:
+    """The operation with what no derivative is asked of."""
+
+    pooling: int
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return TRANSMISSION.dispatched(*inputs, self.pooling)
+
+    def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
+        found = TRANSMISSION_BACKWARD.dispatched(gradient, *inputs, self.pooling, needed[1])
+        return [g if need else None for g, need in zip(found, needed)]
+
+    def reference(self, path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor) -> Tensor:
+        return _transmitted(path_lengths, attenuation, weights, kernel, self.pooling)
+
+
+def _transmitted(path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor, pooling: int) -> Tensor:
+    """The definition, in plain torch."""
+    exponents = torch.einsum("me,kmvij->kevij", attenuation, path_lengths)
+    signal = torch.einsum("kve,kevij->kvij", weights, torch.exp(-exponents))
+    return avg_pool2d(convolve_by(convolve_by(signal, kernel, -2), kernel, -1), pooling)
+
+
+def _gradients(
+    grad: Tensor,
     path_lengths: Tensor,
     attenuation: Tensor,
     weights: Tensor,
     kernel: Tensor,
-    scatter: Tensor,
-    pooling: int = 1,
-) -> Tensor:
-    """Line integrals `(K, V, rows, cols)` of materials' path lengths `(K, M, V, rows, cols)`.
-
-    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s)`, candidate by candidate; only images of the size of the result
-    are kept for the gradient, whatever the number of energies.
-
-    Args:
-        path_lengths: Path lengths in mm, `(K, M, V, rows, cols)`.
-        attenuation: Attenuation coefficients in 1/mm, `(M, energies)`; no gradient.
-        weights: Weights of the energies, `(K, energies)`.
-        kernel: One-dimensional blur kernels, `(K, odd)`, applied along rows and columns.
-        scatter: Scatter s in units of the open beam, of a shape that broadcasts to that of the result.
-        pooling: Blurred transmissions are averaged over squares of this many pixels a side, which divides the images.
-
-    Returns:
-        Differentiable in everything but the attenuation: gradients by formulas of their own, all other derivatives by
-        those of plain torch, which keep an image for each energy.
-    """
-    num_candidates, _, views, rows, cols = path_lengths.shape
-    spread = scatter.to(path_lengths).expand(num_candidates, views, rows // pooling, cols // pooling)
-    inputs = (path_lengths, weights, kernel, spread)
-    return differentiable(_LineIntegrals(attenuation.detach(), pooling), *inputs)
+    pooling: int,
+    need_attenuation: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of the definition by autograd; that to the attenuation comes back empty where it is not needed."""
+    inputs = [t.detach().requires_grad_(True) for t in (path_lengths, attenuation, weights, kernel)]
+    with torch.enable_grad():
+        result = _transmitted(inputs[0], inputs[1], inputs[2], inputs[3], pooling)
+    to_lengths, to_attenuation, to_weights, to_kernel = torch.autograd.grad(result, inputs, grad)
+    return to_lengths, to_attenuation if need_attenuation else grad.new_empty(0), to_weights, to_kernel
 
 
-@dataclass(frozen=True)
-class _LineIntegrals:
-    """See `polyenergetic_line_integrals`."""
-
-    attenuation: Tensor
-    pooling: int
-
-    def forward(self, path_lengths: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor) -> Tensor:
-        coefficients = self.attenuation.tolist()
-        image_shape = path_lengths.shape[2:]
-        result = path_lengths.new_empty(scatter.shape)
-        for candidate, (shares, blur) in enumerate(zip(weights.tolist(), kernel.tolist())):
-            lengths = path_lengths[candidate].flatten(1)
-            signal = transmitted(lengths, coefficients, shares).view(image_shape)
-            for view in range(image_shape[0]):
-                blurred = _pooled(convolve(convolve(signal[view], blur, -2), blur, -1), self.pooling)
-                _add_floor(blurred, scatter[candidate, view], out=result[candidate, view]).log_().neg_()
-        return result
-
-    def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
-        path_lengths, weights, kernel, scatter = inputs
-        coefficients = self.attenuation.tolist()
-        wants_lengths, wants_weights, wants_kernel, wants_scatter = needed
-        grad_lengths = torch.empty_like(path_lengths) if wants_lengths else None
-        grad_scatter = torch.empty(scatter.shape).to(scatter) if wants_scatter else None
-        grad_weights, grad_kernel = [], []
-        for candidate, (shares, blur) in enumerate(zip(weights.tolist(), kernel.tolist())):
-            lengths = path_lengths[candidate].flatten(1)
-            signal = transmitted(lengths, coefficients, shares).view(path_lengths.shape[2:])
-            along_rows = convolve(signal, blur, -2)
-            blurred = _pooled(convolve(along_rows, blur, -1), self.pooling)
-            total = _add_floor(blurred, scatter[candidate], out=blurred)
-            grad_signal = total.reciprocal_().mul_(gradient[candidate]).neg_()
-            if grad_scatter is not None:
-                grad_scatter[candidate] = grad_signal
-            grad_signal = _spread(grad_signal, self.pooling)
-            grad_rows = convolve_adjoint(grad_signal, blur, -1)
-            if wants_kernel:
-                radius = len(blur) // 2
-                first = kernel_gradient(signal, grad_rows, radius, -2)
-                second = kernel_gradient(along_rows, grad_signal, radius, -1)
-                grad_kernel.append([a + b for a, b in zip(first, second)])
-            grad_signal = convolve_adjoint(grad_rows, blur, -2).flatten()
-            out = grad_lengths[candidate].flatten(1) if grad_lengths is not None else None
-            grad_weights.append(_transmission_gradient(lengths, coefficients, shares, grad_signal, out))
-        return [
-            grad_lengths,
-            weights.new_tensor(grad_weights) if wants_weights else None,
-            kernel.new_tensor(grad_kernel) if wants_kernel else None,
-            grad_scatter,
-        ]
-
-    def reference(self, path_lengths: Tensor, weights: Tensor, kernel: Tensor, scatter: Tensor) -> Tensor:
-        exponents = torch.einsum("me,kmvij->kevij", self.attenuation.to(path_lengths), path_lengths)
-        signal = torch.einsum("ke,kevij->kvij", weights.to(path_lengths), torch.exp(-exponents))
-        blurred = convolve_by(convolve_by(signal, kernel.to(signal), -2), kernel.to(signal), -1)
-        floor = torch.finfo(signal.dtype).tiny
-        return -torch.log((avg_pool2d(blurred, self.pooling) + scatter).clamp_min(floor))
+def _fake_images(lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor, pooling: int) -> Tensor:
+    candidates, _, views, rows, cols = lengths.shape
+    return lengths.new_empty(candidates, views, rows // pooling, cols // pooling)
 
 
-def transmitted(lengths: Tensor, attenuation: list[list[float]], weights: list[float]) -> Tensor:
-    """Transmitted signal `(pixels,)`, `sum_k w_k exp(-sum_m mu_mk L_m)`, of path lengths `(M, pixels)` in mm."""
-    result = lengths.new_zeros(lengths.shape[1])
-    for start in range(0, len(result), BLOCK_PIXELS):
-        block = lengths[:, start : start + BLOCK_PIXELS]
-        total = result[start : start + BLOCK_PIXELS]
-        for energy, weight in enumerate(weights):
-            total.add_(_attenuated(block, attenuation, energy), alpha=weight)
-    return result
+def _fake_gradients(
+    grad: Tensor,
+    lengths: Tensor,
+    attenuation: Tensor,
+    weights: Tensor,
+    kernel: Tensor,
+    pooling: int,
+    need_attenuation: bool,
+) -> tuple[Tensor, ...]:
+    to_attenuation = lengths.new_empty(attenuation.shape if need_attenuation else (0,))
+    return lengths.new_empty(lengths.shape), to_attenuation, *(t.new_empty(t.shape) for t in (weights, kernel))
 
 
-def _attenuated(block: Tensor, attenuation: list[list[float]], energy: int) -> Tensor:
-    """`exp(-sum_m mu_m L_m)` at one energy."""
-    exponent = block[0] * -attenuation[0][energy]
-    for material in range(1, len(block)):
-        exponent.add_(block[material], alpha=-attenuation[material][energy])
-    return exponent.exp_()
-
-
-def _transmission_gradient(
-    lengths: Tensor, attenuation: list[list[float]], weights: list[float], upstream: Tensor, out: Tensor | None
-) -> list[float]:
-    """Derivatives of `<transmitted, upstream>` to the weights; those to the path lengths go into `out`."""
-    grad_weights = [0.0] * len(weights)
-    if out is not None:
-        out.zero_()
-    for start in range(0, lengths.shape[1], BLOCK_PIXELS):
-        stop = start + BLOCK_PIXELS
-        for energy, weight in enumerate(weights):
-            passed = _attenuated(lengths[:, start:stop], attenuation, energy).mul_(upstream[start:stop])
-            grad_weights[energy] += float(passed.sum())
-            if out is not None:
-                for material, coefficients in enumerate(attenuation):
-                    out[material, start:stop].add_(passed, alpha=-weight * coefficients[energy])
-    return grad_weights
-
-
-def _pooled(images: Tensor, pooling: int) -> Tensor:
-    """Images `(..., rows, cols)` averaged over squares of pixels."""
-    return images if pooling == 1 else avg_pool2d(images.unsqueeze(0), pooling).squeeze(0)
-
-
-def _spread(images: Tensor, pooling: int) -> Tensor:
-    """The adjoint of `_pooled`."""
-    if pooling == 1:
-        return images
-    return (images / pooling**2).repeat_interleave(pooling, -2).repeat_interleave(pooling, -1)
-
-
-def _add_floor(signal: Tensor, floor: Tensor, *, out: Tensor) -> Tensor:
-    """Signal plus floor, kept positive: a negative floor must not turn into NaN."""
-    return torch.add(signal, floor, out=out).clamp_min_(torch.finfo(signal.dtype).tiny)
+# lengths (K, M, V, rows, cols), attenuation (M, E), weights (K, V, E), kernel (K, odd) -> (K, V, rows, cols)
+TRANSMISSION = Operator(
+    "transmission(Tensor lengths, Tensor attenuation, Tensor weights, Tensor kernel, int pooling) -> Tensor",
+    reference=_transmitted,
+    fake=_fake_images,
+)
+TRANSMISSION_BACKWARD = Operator(
+    "transmission_backward(Tensor grad, Tensor lengths, Tensor attenuation, Tensor weights, Tensor kernel, "
+    "int pooling, bool need_attenuation) -> (Tensor, Tensor, Tensor, Tensor)",
+    reference=_gradients,
+    fake=_fake_gradients,
+)

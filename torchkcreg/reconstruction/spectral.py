@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
-from torchkcreg.physics import Material, Spectrum, calcium_in_water, gaussian_blur, material
+from torchkcreg.physics import Beam, Material, Spectrum, calcium_in_water, gaussian_blur, material
 
 NEWTON_STEPS = 8
 LEAST_LINE_INTEGRAL = -0.5
@@ -18,26 +18,34 @@ CLEARLY_ABOVE = 0.1  # as a share of water: more than noise and fatty or muscula
 
 @dataclass(frozen=True)
 class BeamModel:
-    """Energies of the beam, the metals' attenuation at them, and the background's relative to a reference energy.
+    """A beam, and the background's attenuation at its energies relative to a reference energy.
 
     The background is taken as one material of changing density, water by default: a line integral b at the reference
     energy attenuates energy k by ``exp(-r_k b)``.
 
     Attributes:
-        weights: (K,) shares of the signal, summing to one.
-        attenuation: (M, K) of the metals, 1/mm.
-        background: (K,), r.
-        mineral: (K,), the same ratio for calcium, which hardens the beam more than water.
+        beam: Energies, shares of the signal, and the metals' attenuation.
+        background: (E,), r.
+        mineral: (E,), the same ratio for calcium, which hardens the beam more than water.
         reference_kev: the energy of the reconstructed attenuation; None where the beam counts as monoenergetic.
         water: attenuation of water there, 1/mm, for CT numbers.
     """
 
-    weights: Tensor
-    attenuation: Tensor
+    beam: Beam
     background: Tensor
     mineral: Tensor
     reference_kev: float | None
     water: float
+
+    @property
+    def weights(self) -> Tensor:
+        """(E,) shares of the signal, summing to one."""
+        return self.beam.weights
+
+    @property
+    def attenuation(self) -> Tensor:
+        """(M, E) of the metals, 1/mm."""
+        return self.beam.attenuation
 
     @classmethod
     def polyenergetic(
@@ -60,22 +68,39 @@ class BeamModel:
         """
         base = material("water") if background is None else background
         energy = spectrum.mean_energy if reference_kev is None else float(reference_kev)
-        kept = spectrum.reduced([*metals, base], num_bins)
-        attenuation = [m.attenuation(kept.energies_kev) for m in metals]
-        table = torch.stack(attenuation) if attenuation else torch.zeros(0, len(kept.energies_kev), dtype=torch.float64)
-        ratio = base.attenuation(kept.energies_kev) / base.attenuation((energy,))
+        whole = Beam.of([*metals, base], spectrum, num_bins=num_bins)
+        return cls.behind(
+            Beam(whole.energies_kev, whole.weights, whole.attenuation[:-1]), background=base, reference_kev=energy
+        )
+
+    @classmethod
+    def behind(cls, beam: Beam, *, background: Material | None = None, reference_kev: float | None = None) -> BeamModel:
+        """A background of one material, water if None, in a beam, at a reference energy, its mean if None.
+
+        Raises:
+            ValueError: the beam has several spectra.
+        """
+        if beam.sources is not None:
+            raise ValueError("a reconstruction needs one spectrum for all views, got one for each source")
+        base = material("water") if background is None else background
+        energy = float(beam.weights @ beam.energies_kev) if reference_kev is None else float(reference_kev)
+        energies = beam.energies_kev.tolist()
         water, dissolved = material("water"), calcium_in_water(200)
-        calcium = dissolved.attenuation(kept.energies_kev) - water.attenuation(kept.energies_kev)
-        mineral = calcium / (dissolved.attenuation((energy,)) - water.attenuation((energy,)))
-        weights = torch.tensor(kept.weights, dtype=torch.float64)
-        return cls(weights, table, ratio, mineral, energy, float(water.attenuation((energy,))[0]))
+        calcium = dissolved.attenuation(energies) - water.attenuation(energies)
+        return cls(
+            beam,
+            base.attenuation(energies) / base.attenuation((energy,)),
+            calcium / (dissolved.attenuation((energy,)) - water.attenuation((energy,))),
+            energy,
+            float(water.attenuation((energy,))[0]),
+        )
 
     @classmethod
     def monoenergetic(cls, attenuation: Sequence[float], *, water: float = 0.0205) -> BeamModel:
         """A beam of one energy, as in Cao et al. 2020: metals of given attenuation in 1/mm."""
         one = torch.ones(1, dtype=torch.float64)
         table = torch.tensor(list(attenuation), dtype=torch.float64).reshape(-1, 1)
-        return cls(one, table, one, one, None, water)
+        return cls(Beam(torch.zeros_like(one), one, table), one, one, None, water)
 
 
 def behind_metal(path_lengths: Tensor, beam: BeamModel, *, pooling: int = 1, blur_sigma_px: float = 0.0) -> Tensor:

@@ -113,12 +113,12 @@ class Scene(nn.Module):
             lines = view.following(lines, levels)
         return lines[0] if state is None else lines
 
-    def arguments(self, view: View, state: State) -> dict[str, Tensor]:
+    def arguments(self, view: View, state: State) -> dict[str, Any]:
         """Keyword arguments of the intensity model for candidates as a view has them."""
         physics = dict(state.physics)
         if view.data is not None and view.data.scatter_shapes is not None and self.intensity.has_background:
             physics["scatter_shapes"] = view.data.scatter_shapes
-        return physics
+        return physics | self.intensity.of_sources(view.geometry.sources)
 
     def without_components(self, assembly: Assembly) -> Scene:
         """The scene with one of its implants alone, without what is fixed to it; it shares everything else."""

@@ -10,9 +10,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.physics import Spectrum, gaussian_blur, material
+from torchkcreg.physics import Beam, Spectrum, gaussian_blur, material
 from torchkcreg.physics.blur import convolve, gaussian_kernel
-from torchkcreg.physics.transmission import transmitted
 from torchkcreg.simulation.parts import Part, material_paths
 
 SCATTER_BLOCK = 8  # scatter is smooth: it is computed on blocks of this many pixels squared
@@ -125,13 +124,11 @@ def _primary(
     fine[:2] = factor * matrix[:2] + (factor - 1) / 2 * matrix[2]
     fine_shape = (det_shape[0] * factor, det_shape[1] * factor)
     paths = material_paths(parts, fine, fine_shape)
-    signal = torch.ones(fine_shape, dtype=torch.float64).flatten()
-    if paths:
-        lengths = torch.stack(list(paths.values())).flatten(1)
-        behind = (lengths != 0).any(0).nonzero()[:, 0]
-        table = [material(name).attenuation(spectrum.energies_kev).tolist() for name in paths]
-        signal[behind] = transmitted(lengths[:, behind], table, list(spectrum.weights))
-    return signal.reshape(det_shape[0], factor, det_shape[1], factor).mean((1, 3))
+    if not paths:
+        return torch.ones(det_shape, dtype=torch.float64)
+    beam = Beam.of([material(name) for name in paths], spectrum, num_bins=None)
+    lengths = torch.stack(list(paths.values()))[None, :, None]
+    return beam.transmission(lengths, pooling=factor)[0, 0]
 
 
 def _detected(primary: Tensor, pixel_spacing: tuple[float, float], detector: DetectorModel) -> Tensor:
