@@ -8,6 +8,7 @@ FLOORS = {
     "console": 0,
     "differentiable": 0,
     "parameters": 0,
+    "plain": 0,
     "precision": 0,
     "kernels": 0,
     "geometry": 1,

@@ -6,9 +6,9 @@ import pytest
 import torch
 import trimesh
 
-from torchkcreg.evaluation import deformed_surface, evaluate_shape
+from torchkcreg.evaluation import evaluate_shape
 from torchkcreg.geometry import rigid_matrix, transform_points
-from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.implant import ImplantPointCloud, deformed_surface
 
 MOTION = rigid_matrix(torch.tensor([0.004, -0.006, 0.008]).double(), torch.tensor([0.2, -0.1, 0.15]).double())
 
@@ -122,10 +122,10 @@ class Bow:
 
 def test_a_deformed_surface_bends_between_its_vertices_too():
     box = trimesh.creation.box((100.0, 4.0, 4.0))
-    bent = deformed_surface(Bow(), box)
+    bent = deformed_surface(Bow().warp, box)
     middle = torch.tensor([[0.0, 0.0, 2.0]]).double()
     assert bent.is_watertight
     assert np.abs(trimesh.proximity.closest_point(bent, Bow().warp(middle).numpy())[1]).max() < 0.01
     assert bent.vertices[:, 2].max() == pytest.approx(2 + 50**2 / 500)
     with pytest.raises(ValueError, match="longest_edge_mm must be positive"):
-        deformed_surface(Bow(), box, longest_edge_mm=0)
+        deformed_surface(Bow().warp, box, longest_edge_mm=0)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchkcreg.io.files import atomic_path, finite_array, plain, read_json, write_json, write_text
+from torchkcreg.io.files import atomic_path, read_json, write_json, write_text
+from torchkcreg.plain import finite_array, plain
 
 
 def test_a_file_that_was_written_holds_the_text_and_nothing_lies_beside_it(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small_scene import RIGID, bend, image, plate, pose, scene
+from small_scene import RIGID, SCREW, bend, geometry, image, plate, pose, scene
 
 from torchkcreg.deformation import LinearDeformation, RigidDeformation
 from torchkcreg.geometry import transform_points
@@ -13,6 +13,7 @@ from torchkcreg.registration import (
     Implant,
     Optimizer,
     RegistrationConfig,
+    RegistrationResult,
     Stage,
     StageRun,
     Trainer,
@@ -235,3 +236,44 @@ def test_a_result_projects_itself_into_any_views_and_describes_itself() -> None:
     drr = result.project(data.geometry)
     assert float(gradient_correlation(drr, data.line_integrals).min()) > 0.999
     assert repr(result).startswith(f"RegistrationResult({result.status}: implant, gc 1.000 1.000 1.000, expected error")
+
+
+def test_a_result_is_saved_with_its_scene_and_loaded(tmp_path) -> None:
+    config = RIGIDLY.model_copy(update={"material": "steel", "stages": RIGID[1:2]})
+    data = image(scene(config, pose(0.3, 0.3), components=[SCREW]))
+    result = register(plate(), data, config, components=[SCREW])
+    result.save(tmp_path / "result.pt")
+    again = RegistrationResult.load(tmp_path / "result.pt")
+    points = plate().points.double()
+    torch.testing.assert_close(again.warp(points), result.warp(points), atol=1e-12, rtol=0)
+    torch.testing.assert_close(again.project(geometry()), result.project(geometry()))
+    assert repr(again) == repr(result) and again.history == result.history
+    (tmp_path / "result.pt").write_bytes(b"no result")
+    with pytest.raises(ValueError, match=r"result .* cannot be read"):
+        RegistrationResult.load(tmp_path / "result.pt")
+    result.scene = None
+    with pytest.raises(ValueError, match="read from a run folder"):
+        result.project(geometry())
+
+
+def test_known_components_and_the_beam_come_from_the_result_in_memory() -> None:
+    config = RIGIDLY.model_copy(update={"material": "titanium", "stages": RIGID[1:2]})
+    result = register(plate(), image(scene(config, components=[SCREW])), config, components=[SCREW])
+    bent, screw = result.known_components()
+    assert (bent.material, screw.material) == ("titanium", "steel")
+    assert bent.cloud.volume == pytest.approx(plate().volume) and screw.cloud.volume == pytest.approx(
+        SCREW.cloud.volume
+    )
+    moved = transform_points(result.implants[0].motion_of(SCREW.as_screw), SCREW.head[None].double())
+    torch.testing.assert_close(moved, result.warp(SCREW.head[None]), atol=0.02, rtol=0)
+    beam = result.beam()
+    assert float(beam.weights.sum()) == pytest.approx(1.0) and beam.attenuation.shape[0] == 2
+    data = image(scene(config, components=[SCREW]))
+    scatter = result.scatter(torch.exp(-data.line_integrals), data.geometry)
+    assert scatter.shape == data.line_integrals.shape
+    assert 0 < float(scatter.mean()) <= result.intensity["scatter"]
+    plain = register(plate(), image(scene(RIGIDLY)), RIGIDLY.model_copy(update={"stages": RIGID[1:2]}))
+    with pytest.raises(ValueError, match="registered without a material"):
+        plain.known_components()
+    with pytest.raises(ValueError, match="had no beam"):
+        plain.beam()

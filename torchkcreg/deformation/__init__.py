@@ -19,6 +19,7 @@ from torchkcreg.deformation.modal_motion import ModalMotion
 from torchkcreg.deformation.model import Deformation, Level, Motion
 from torchkcreg.deformation.penalty import diffusion_penalty, without_rigid
 from torchkcreg.deformation.prior import BendingPrior
+from torchkcreg.deformation.reading import deformation_from_dict
 from torchkcreg.deformation.spline_field import SplineField
 from torchkcreg.deformation.strain import strain_energy
 
@@ -38,6 +39,7 @@ __all__ = [
     "cluster_control_points",
     "control_point_volumes",
     "control_points_from_groups",
+    "deformation_from_dict",
     "diffusion_penalty",
     "group_centers",
     "group_moment_gradients",

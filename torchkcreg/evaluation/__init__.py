@@ -2,7 +2,6 @@
 
 from .alignment import align_to_surface, rigid_coherent_point_drift
 from .beads import Beads, find_beads
-from .deformed_surface import deformed_surface
 from .displacement import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
 from .points import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
@@ -20,7 +19,6 @@ __all__ = [
     "align_to_surface",
     "bb_rmse",
     "cylinder_region",
-    "deformed_surface",
     "displacement_map",
     "distance_statistics",
     "distance_to",

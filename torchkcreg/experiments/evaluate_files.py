@@ -13,7 +13,6 @@ from torch import Tensor
 from torchkcreg.evaluation import (
     PointMetrics,
     ShapeEvaluation,
-    deformed_surface,
     displacement_map,
     evaluate,
     evaluate_shape,
@@ -98,7 +97,7 @@ def evaluate_files(
         true = read_reference(reference)
         pitch = result.config.pitch_mm
         nodes = result.warp(ImplantPointCloud.from_mesh(mesh, pitch, dtype=torch.float64).points)
-        surface = deformed_surface(result, mesh)
+        surface = result.deformed(mesh)
         shape = evaluate_shape(surface, nodes, true, pitch_mm=pitch, reference_kind=reference_kind)
     pictures = _draw(figures, result, mesh, shape, pairs) if figures is not None and mesh is not None else ()
     return FileEvaluation(metrics, shape, tuple(pictures))

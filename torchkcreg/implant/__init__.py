@@ -3,6 +3,7 @@
 from torchkcreg.implant.closed_mesh import closed_mesh, closed_triangles, volume
 from torchkcreg.implant.components import Component
 from torchkcreg.implant.cylinders import cylinder_cloud, cylinder_mesh
+from torchkcreg.implant.deformed import deformed_surface
 from torchkcreg.implant.holes import Hole, find_holes
 from torchkcreg.implant.morton import morton_order
 from torchkcreg.implant.partial_volumes import FilledCells, fill_cells
@@ -20,6 +21,7 @@ __all__ = [
     "closed_triangles",
     "cylinder_cloud",
     "cylinder_mesh",
+    "deformed_surface",
     "fill_cells",
     "find_holes",
     "morton_order",

@@ -84,6 +84,12 @@ class Screw:
         turned = transform_points(rotation_about(ends[0], rotation.cpu().double()), ends) + shift.cpu().double()
         return replace(self, start=tuple(turned[0].tolist()), end=tuple(turned[1].tolist()))
 
+    def moved_by(self, motion: Tensor) -> Screw:
+        """The screw after a rigid motion (4, 4)."""
+        ends = torch.tensor([self.start, self.end], dtype=torch.float64)
+        start, end = transform_points(motion.detach().cpu().double(), ends).tolist()
+        return replace(self, start=tuple(start), end=tuple(end))
+
     def mesh(self) -> trimesh.Trimesh:
         """Its surface, a prism of exactly its volume."""
         return cylinder_mesh(self.start, self.end, self.radius)

@@ -15,7 +15,6 @@ from .plausible import implausible_magnification
 from .points import read_points, write_points
 from .projections import Projections, read_projections, write_projections
 from .references import read_reference
-from .results import result_from_dict, result_to_dict
 from .runs import RunFolder, read_run
 from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
@@ -42,8 +41,6 @@ __all__ = [
     "read_run",
     "read_spectrum",
     "read_volume",
-    "result_from_dict",
-    "result_to_dict",
     "versions",
     "write_components",
     "write_config",

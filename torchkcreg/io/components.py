@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchkcreg.implant import Screw
-from torchkcreg.io.files import finite_array, finite_number, read_json, write_json
+from torchkcreg.io.files import read_json, write_json
+from torchkcreg.plain import finite_array, finite_number
 
 
 def read_components(path: str | os.PathLike[str]) -> list[Screw]:

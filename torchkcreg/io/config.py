@@ -8,7 +8,8 @@ from typing import Any
 
 import yaml
 
-from torchkcreg.io.files import plain, read_text, write_text
+from torchkcreg.io.files import read_text, write_text
+from torchkcreg.plain import plain
 
 
 class _Loader(yaml.SafeLoader):

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import codecs
 import json
-import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
+from torchkcreg.plain import plain
 
 TEMPORARY_PREFIX = ".writing-"
 
@@ -92,61 +90,3 @@ def read_json(path: str | os.PathLike[str], what: str) -> Any:
 def write_json(path: str | os.PathLike[str], content: Any, *, indent: int | None = 1) -> None:
     """Nothing; writes `content` as strict JSON, whole or not at all (see `plain` for what it may hold)."""
     write_text(path, json.dumps(plain(content), indent=indent, allow_nan=False) + "\n")
-
-
-def plain(content: Any) -> Any:
-    """`content` as numbers, strings, lists and dicts: what JSON, YAML and a checkpoint can hold.
-
-    Tensors and arrays become (nested) lists, NumPy scalars numbers, tuples lists, paths strings. JSON knows no NaN
-    and no infinity: they become None.
-
-    Raises:
-        ValueError: something else is in it; names its type and where it is.
-    """
-    return _plain(content, "")
-
-
-def _plain(content: Any, where: str) -> Any:
-    if content is None or isinstance(content, (bool, int, str)):
-        return content
-    if isinstance(content, float):
-        return float(content) if math.isfinite(content) else None
-    if isinstance(content, torch.Tensor):
-        return _plain(content.detach().cpu().tolist(), where)
-    if isinstance(content, (np.ndarray, np.generic)):
-        return _plain(content.tolist(), where)
-    if isinstance(content, os.PathLike):
-        return os.fspath(content)
-    if isinstance(content, dict):
-        return {str(key): _plain(value, f"{where}[{key!r}]") for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_plain(value, f"{where}[{i}]") for i, value in enumerate(content)]
-    raise ValueError(f"cannot write a {type(content).__name__} as plain data{f' (at {where})' if where else ''}")
-
-
-def finite_number(value: Any, name: str, *, positive: bool = False) -> float:
-    """`value` as a float; ValueError(name ...) when it is no finite number, or not above zero where asked."""
-    wanted = "a positive number" if positive else "a finite number"
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{name} must be {wanted}, got {value!r}")
-    if positive and value <= 0:
-        raise ValueError(f"{name} must be {wanted}, got {value!r}")
-    return float(value)
-
-
-def finite_array(value: Any, shape: tuple[int, ...], name: str) -> torch.Tensor:
-    """`value` (nested lists) as a float64 tensor of `shape`; ValueError(name ...) when it is anything else."""
-    try:
-        array = np.array(value)
-    except ValueError:
-        array = np.array(None)
-    if array.shape != shape or array.dtype.kind not in "iuf":
-        raise ValueError(f"{name} must be {' x '.join(map(str, shape))} numbers, got {_short(value)}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, got {_short(value)}")
-    return torch.from_numpy(array.astype(np.float64))
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

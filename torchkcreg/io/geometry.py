@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.io.files import finite_array, finite_number, read_json, write_json
+from torchkcreg.io.files import read_json, write_json
+from torchkcreg.plain import finite_array, finite_number
 
 CONVENTION = "u = (P[0].X)/(P[2].X), v = (P[1].X)/(P[2].X); X=(x,y,z,1) in mm; u column, v row, 0-based pixel centres"
 SOURCE_TOLERANCE_MM = 0.1

@@ -7,7 +7,8 @@ import os
 import torch
 from torch import Tensor
 
-from torchkcreg.io.files import finite_array, read_json, write_json
+from torchkcreg.io.files import read_json, write_json
+from torchkcreg.plain import finite_array
 
 ROUNDING = 2e-3
 

@@ -17,9 +17,9 @@ from torchkcreg.io.config import write_config
 from torchkcreg.io.figures import write_figure
 from torchkcreg.io.files import TEMPORARY_PREFIX, atomic_path, read_json, write_json
 from torchkcreg.io.meshes import write_point_cloud_ply
-from torchkcreg.io.results import result_from_dict, result_to_dict
 from torchkcreg.io.transforms import warp, write_displacement_field, write_itk_transform
 from torchkcreg.io.versions import versions
+from torchkcreg.plain import plain
 from torchkcreg.registration import RegistrationResult
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class RunFolder:
         Raises:
             ValueError: a parameter is not finite.
         """
-        content = result_to_dict(result)  # refuses what cannot be written before anything is
+        content = plain(result.to_dict())  # refuses what cannot be written before anything is
         (self.path / DEFORMATION).unlink(missing_ok=True)
         self.write_history(result.history)
         starts = initial_to_world or [torch.eye(4, dtype=torch.float64)] * len(result.implants)
@@ -177,7 +177,7 @@ class RunFolder:
         history = read_json(self.path / HISTORY, "history") if (self.path / HISTORY).is_file() else []
         content = read_json(path, "deformation")
         try:
-            return result_from_dict(content, history=history)
+            return RegistrationResult.from_dict(content, history=history)
         except ValueError as error:
             raise ValueError(f"deformation file {path}: {' '.join(str(error).split())}") from error
 

@@ -3,7 +3,7 @@
 from torchkcreg.physics.beam import Beam
 from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
 from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
-from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission
+from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission, intensity_from_dict
 from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
 from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
 from torchkcreg.physics.scatter import scatter_shapes, scattered_signal
@@ -22,6 +22,7 @@ __all__ = [
     "calcium_in_water",
     "gaussian_blur",
     "gaussian_kernel",
+    "intensity_from_dict",
     "line_integrals_from_intensity",
     "material",
     "material_names",

@@ -107,6 +107,11 @@ class Beam(ExactModule):
         logs = own.log() if own.dim() == 2 else own.log()[None]
         return torch.softmax(logs - hardness.to(logs)[:, None, None] * self.aluminium, dim=-1)
 
+    def behind(self, hardness: float, materials: Sequence[int]) -> Beam:
+        """The beam of one spectrum behind so many mm of aluminium, with some of the materials, by their numbers."""
+        weights = self.hardened(self.weights.new_tensor([hardness]))[0, 0]
+        return Beam(self.energies_kev, weights, self.attenuation[list(materials)], aluminium=self.aluminium)
+
     def transmission(
         self,
         path_lengths: Tensor,

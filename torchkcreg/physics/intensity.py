@@ -12,9 +12,10 @@ from torch.nn.functional import avg_pool2d
 from torchkcreg.physics.beam import Beam
 from torchkcreg.physics.blur import gaussian_kernel
 from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
-from torchkcreg.physics.materials import Material
+from torchkcreg.physics.materials import Material, material
 from torchkcreg.physics.scatter import scattered_signal
 from torchkcreg.physics.spectra import Spectrum
+from torchkcreg.plain import require_keys
 from torchkcreg.precision import full_precision
 
 # Standard deviations of where scanners and limbs have these parameters.
@@ -26,6 +27,10 @@ _LIKELY_HARDNESS_MM = {True: 0.5, False: 3.0}  # of aluminium: spectrum known, u
 
 class IdentityIntensity(IntensityModel):
     """Path lengths as they are, summed over the materials: the model of Cao et al. 2020."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nothing but the model's name."""
+        return {"model": "identity"}
 
     def forward(self, path_lengths: Tensor, *, pooling: int = 1) -> Tensor:
         """Summed path lengths `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)`, averaged over squares.
@@ -123,6 +128,19 @@ class PolyenergeticTransmission(IntensityModel):
         self.hardness = _parameter(hardness)
         self.beam = Beam.of(materials, spectrum, num_bins=num_bins)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Materials, spectra and parameters."""
+        weights = self.beam.weights if self.beam.sources else self.beam.weights[None]
+        return {
+            "model": "polyenergetic",
+            "materials": list(self.material_names),
+            "has_background": self.has_background,
+            "energies_kev": self.beam.energies_kev.tolist(),
+            "weights": weights.tolist(),
+            "sources": None if self.beam.sources is None else list(self.beam.sources),
+            "parameters": {name: float(value.detach()) for name, value in self.named_parameters()},
+        }
+
     def of_sources(self, sources: Sequence[str] | None) -> dict[str, Any]:
         """The sources, where each has a spectrum of its own."""
         return {} if self.beam.sources is None else {"sources": sources}
@@ -206,3 +224,32 @@ def _per_candidate(name: str, own: Tensor, override: Tensor | None, leading: tor
         return value.broadcast_to(leading).reshape(-1)
     except RuntimeError as error:
         raise ValueError(f"{name} must fit the candidates {tuple(leading)}, got {tuple(value.shape)}") from error
+
+
+def intensity_from_dict(content: Any) -> IntensityModel:
+    """The intensity model that `IntensityModel.to_dict` described.
+
+    Raises:
+        ValueError: A key is missing or malformed; the message names it.
+    """
+    require_keys(content, ("model",), " of an intensity model")
+    if content["model"] == "identity":
+        return IdentityIntensity()
+    if content["model"] != "polyenergetic":
+        raise ValueError(f"model must be identity or polyenergetic, got {content['model']!r}")
+    require_keys(content, ("materials", "energies_kev", "weights", "parameters"), " of an intensity model")
+    spectra = [_spectrum(content["energies_kev"], weights) for weights in content["weights"]]
+    sources, names = content.get("sources"), list(content["materials"])
+    background = material(names.pop()) if content.get("has_background") else None
+    return PolyenergeticTransmission(
+        [material(name) for name in names],
+        spectra[0] if sources is None else dict(zip(sources, spectra, strict=True)),
+        num_bins=None,
+        background=background,
+        **content["parameters"],
+    )
+
+
+def _spectrum(energies: Sequence[float], weights: Sequence[float]) -> Spectrum:
+    kept = sorted((energy, weight) for energy, weight in zip(energies, weights, strict=True) if weight > 0)
+    return Spectrum(tuple(energy for energy, _ in kept), tuple(weight for _, weight in kept))

@@ -59,6 +59,10 @@ class IntensityModel(nn.Module):
             found[free.attribute] = value / pixel_px if free.in_pixels else value
         return found
 
+    def to_dict(self) -> dict[str, Any]:
+        """The model as plain types, for files; "model" names what reads it."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be written: it has no to_dict")
+
     def of_sources(self, sources: Sequence[str] | None) -> dict[str, Any]:
         """Keyword arguments of `forward` that depend on the names of the views' sources; none by default."""
         return {}

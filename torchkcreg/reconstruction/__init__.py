@@ -4,13 +4,14 @@
 into line integrals and weights, with known components (KC-Rec), scatter and beam hardening accounted for.
 """
 
+from torchkcreg.scene import KnownComponent
+
 from .corrections import Veil, fit_veil, floored_line_integrals, refined_scatter, veil_image
 from .ct_numbers import hounsfield
 from .dead_pixels import filled
 from .fdk import FDKConfig, fdk
 from .field_of_view import coverage, field_of_view_grid
 from .known_component import (
-    KnownComponent,
     component_path_lengths,
     component_shares,
     known_materials,

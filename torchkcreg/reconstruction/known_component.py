@@ -3,51 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import torch
-import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
-from torchkcreg.implant import ImplantPointCloud, voxelize_mesh, voxelize_points
 from torchkcreg.projector import project_points
+from torchkcreg.scene import KnownComponent
 
 from .spectral import BeamModel, background_line_integrals, behind_metal
 
 BLOCK_VIEWS = 8
 COVERED = 0.999  # a voxel as full as this of metal shows nothing of the background
-
-
-@dataclass(frozen=True)
-class KnownComponent:
-    """A piece of metal in its place in the world: bent plate, screw.
-
-    Attributes:
-        cloud: fine nodes with partial volumes, in world mm.
-        material: name of its material.
-        mesh: its surface in world mm, where there is one: makes the mask exact.
-    """
-
-    cloud: ImplantPointCloud
-    material: str
-    mesh: trimesh.Trimesh | None = None
-
-    @classmethod
-    def from_mesh(cls, mesh: trimesh.Trimesh, material: str, *, pitch: float = 0.25) -> KnownComponent:
-        """From a closed surface in world mm.
-
-        >>> ball = KnownComponent.from_mesh(trimesh.creation.icosphere(2, 3.0), "steel", pitch=0.5)
-        >>> ball.material, ball.mesh.is_watertight
-        ('steel', True)
-        """
-        return cls(ImplantPointCloud.from_mesh(mesh, pitch), material, mesh)
-
-    def fraction(self, grid: VolumeGrid) -> Tensor:
-        """Share of each voxel that it fills, (D, H, W)."""
-        if self.mesh is not None:
-            return voxelize_mesh(self.mesh, grid)
-        return voxelize_points(self.cloud.points, self.cloud.volumes, grid, cell=self.cloud.cell).clamp(0, 1)
 
 
 def known_materials(components: Sequence[KnownComponent]) -> list[str]:
@@ -58,6 +25,7 @@ def known_materials(components: Sequence[KnownComponent]) -> list[str]:
 def unknown_share(components: Sequence[KnownComponent], grid: VolumeGrid) -> Tensor:
     """The mask s (D, H, W): the share of each voxel that no component fills.
 
+    >>> import trimesh
     >>> ball = KnownComponent.from_mesh(trimesh.creation.icosphere(2, 3.0), "steel", pitch=0.5)
     >>> unknown_share([ball], VolumeGrid.centered((3, 3, 3), 1.0))[1, 1, 1].item()
     0.0

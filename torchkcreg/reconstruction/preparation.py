@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
+from torchkcreg.scene import KnownComponent
 
 from .corrections import Veil, floored_line_integrals, veil_image
 from .dead_pixels import filled_transmission
-from .known_component import KnownComponent, component_shares, without_components
+from .known_component import component_shares, without_components
 from .spectral import BeamModel
 from .weights import statistical_weights
 

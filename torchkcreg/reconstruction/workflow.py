@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.physics import Beam
+from torchkcreg.scene import KnownComponent
 
 from .corrections import Veil, refined_scatter, veil_image
-from .known_component import KnownComponent, component_shares, unknown_share
+from .known_component import component_shares, unknown_share
 from .preparation import PreparedData, prepare
 from .pwls import PWLS
 from .pwls_config import PWLSConfig
@@ -46,7 +48,7 @@ def reconstruct(
     transmission: Tensor,
     geometry: ConeBeamGeometry,
     grid: VolumeGrid,
-    beam: BeamModel,
+    beam: BeamModel | Beam,
     *,
     config: PWLSConfig | None = None,
     components: Sequence[KnownComponent] = (),
@@ -70,7 +72,7 @@ def reconstruct(
         transmission: measured intensity over the open beam's, (V, rows, cols).
         geometry: the views.
         grid: the voxels.
-        beam: energies, and the attenuation of the components' materials.
+        beam: energies, and the attenuation of the components' materials, such as a registration's own.
         config: of each pass.
         components: metal in its registered place; none: plain PWLS.
         scatter: see `prepare`.
@@ -86,6 +88,7 @@ def reconstruct(
     """
     if passes < 1:
         raise ValueError(f"passes must be at least 1, got {passes}")
+    beam = BeamModel.behind(beam) if isinstance(beam, Beam) else beam
     system = VoxelSystem(geometry, grid, backend=backend)
     unknown = unknown_share(components, grid).to(transmission) if components else None
     if isinstance(scatter, Veil):

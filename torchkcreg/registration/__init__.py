@@ -7,7 +7,8 @@ from .callbacks import Callback, ProgressBar, TrainerState
 from .config import RegistrationConfig, Stage, preset_stages
 from .objective import Objective
 from .register import Implant, build_scene, register
-from .result import RegisteredImplant, RegistrationResult
+from .registered_implant import RegisteredImplant
+from .result import RegistrationResult
 from .screws import find_screws
 from .stage_run import StageRun, Terms, similarities
 from .steps import AFTER, BEFORE

@@ -11,7 +11,8 @@ from torchkcreg.similarity import GradientCorrelation, GradientDifference
 
 from .config import RegistrationConfig, Stage
 from .diagnosis import diagnose
-from .result import RegisteredImplant, RegistrationResult
+from .registered_implant import RegisteredImplant
+from .result import RegistrationResult
 from .stage_run import StageRun, Terms, changed, similarities
 from .verdict import Rival, judge
 
@@ -43,7 +44,7 @@ def finished(
         reasons = [*reasons, f"the registration was ended before its time: {stopped}"]
         status = "doubtful" if status == "ok" else status
     return RegistrationResult(
-        implants=[RegisteredImplant.of(assembly) for assembly in scene],
+        implants=[RegisteredImplant.of(assembly, has_material=config.material is not None) for assembly in scene],
         gc=gc,
         history=list(history),
         stages=list(records),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,69 +12,19 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.deformation import Deformation
-from torchkcreg.geometry import ConeBeamGeometry, transform_points
+from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.implant import Screw
-from torchkcreg.scene import Assembly, Scene
+from torchkcreg.physics import Beam, PolyenergeticTransmission, scattered_signal
+from torchkcreg.plain import finite_number, require_keys
+from torchkcreg.scene import KnownComponent, RegistrationData, Scene, scene_from_dict, scene_to_dict
 
 from .config import RegistrationConfig
+from .earlier import upgraded
+from .registered_implant import RegisteredImplant
 from .verdict import Status
 
-
-@dataclass
-class RegisteredImplant:
-    """One implant of a registration: ``T(x) = implant_to_world (x + u(x))`` (eq. 1 of Cao et al. 2020).
-
-    Attributes:
-        name: Its name in the scene.
-        implant_to_world: Global rigid transform, shape (4, 4), float64.
-        deformation: Displacements u in the implant's frame.
-        material: Name of its material.
-        components: Rigid motion (4, 4) of each component in the implant's frame.
-        screws: Those of the components that are screws, in the implant's frame before the motion.
-        found: Names of the screws that were found, not given.
-    """
-
-    name: str
-    implant_to_world: Tensor
-    deformation: Deformation
-    material: str = "implant"
-    components: Mapping[str, Tensor] = field(default_factory=dict)
-    screws: list[Screw] = field(default_factory=list)
-    found: list[str] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, assembly: Assembly) -> RegisteredImplant:
-        """An assembly as it is now."""
-        return cls(
-            name=assembly.name,
-            implant_to_world=assembly.implant_to_world.clone(),
-            deformation=assembly.deformation,
-            material=assembly.material,
-            components=assembly.component_motions(),
-            screws=[c.as_screw for c in assembly.components if c.as_screw is not None],
-            found=[screw.name for screw in assembly.found],
-        )
-
-    @torch.no_grad()
-    def displacement(self, points: Tensor) -> Tensor:
-        """u (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64 and that frame."""
-        flat = points.detach().to(self.implant_to_world).reshape(-1, 3)
-        return self.deformation.displacement(flat).reshape(points.shape)
-
-    @torch.no_grad()
-    def warp(self, points: Tensor) -> Tensor:
-        """World positions (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64."""
-        flat = points.detach().to(self.implant_to_world).reshape(-1, 3)
-        return transform_points(self.implant_to_world, flat + self.displacement(flat)).reshape(points.shape)
-
-    def outside(self, points: Tensor) -> Tensor:
-        """True for points (..., 3) where the deformation only goes on from elsewhere."""
-        return self.deformation.outside(points.to(self.implant_to_world))
-
-    def deformed(self, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-        """A mesh of the undeformed implant's frame, in its place in the world; its faces are not divided."""
-        vertices = self.warp(torch.from_numpy(mesh.vertices.copy()))
-        return trimesh.Trimesh(vertices.cpu().numpy(), mesh.faces, process=False)
+FORMAT = "torchkcreg deformation"
+FORMAT_VERSION = 2
 
 
 @dataclass
@@ -84,13 +35,13 @@ class RegistrationResult:
         implants: Each of the registered implants; the first one is what `warp` and its like mean without a name.
         gc: Gradient correlation of each view at the end, shape (V,).
         history: One record an iteration: stage, iteration, loss, step_mm, seconds.
-        stages: One record a stage: iterations, converged, loss, undone.
         config: Options that made the result.
         seed: Seed of the random numbers.
         status: "ok", "doubtful" or "failed": whether the result can be trusted, for the reasons in ``warnings``.
         warnings: What a user should know before trusting the numbers.
         diagnostics: What the verdict rests on, see ``Diagnostics``; ``node_std_mm`` is the expected root mean square
             error of the implant's nodes.
+        stages: One record a stage: iterations, converged, loss, undone.
         intensity: Estimated parameters of the intensity model.
         scene: The scene as it was registered; None for one that was read from a run folder.
     """
@@ -129,15 +80,9 @@ class RegistrationResult:
         return self.implants[0].deformation
 
     @property
-    def components(self) -> Mapping[str, Tensor]:
-        """Of the first implant."""
-        return self.implants[0].components
-
-    @property
     def screws_found(self) -> list[Screw]:
-        """Screws that were found in the first implant, not given, in its frame before the motion."""
-        first = self.implants[0]
-        return [screw for screw in first.screws if screw.name in first.found]
+        """Screws that were found, not given, each in its implant's frame before the motion."""
+        return [screw for implant in self.implants for screw in implant.screws if screw.name in implant.found]
 
     def warp(self, points: Tensor, *, implant: str | None = None) -> Tensor:
         """World positions (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64.
@@ -154,20 +99,157 @@ class RegistrationResult:
         """True for points (..., 3) beyond the valid domain of the control-point grid."""
         return self.implant(implant).outside(points)
 
-    def deformed(self, mesh: trimesh.Trimesh, *, implant: str | None = None) -> trimesh.Trimesh:
-        """A mesh of the undeformed implant's frame, in its place in the world."""
-        return self.implant(implant).deformed(mesh)
+    def deformed(
+        self, mesh: trimesh.Trimesh, *, implant: str | None = None, longest_edge_mm: float = 4.0
+    ) -> trimesh.Trimesh:
+        """A mesh of the undeformed implant's frame, bent and in its place in the world; long edges are split first."""
+        return self.implant(implant).deformed(mesh, longest_edge_mm=longest_edge_mm)
 
     @torch.no_grad()
     def project(self, geometry: ConeBeamGeometry) -> Tensor:
         """Line integrals (V, rows, cols) of the registered implants and their components in any views.
 
         Raises:
-            ValueError: If the result was read from files, which do not keep the implants' nodes.
+            ValueError: If the result was read from a run folder, which does not keep the implants' nodes.
         """
+        return self._scene()(geometry)
+
+    def known_components(
+        self, meshes: trimesh.Trimesh | Mapping[str, trimesh.Trimesh] | None = None, *, pitch: float = 0.25
+    ) -> list[KnownComponent]:
+        """The bent implants and their screws as metal in its place: what KC-Rec takes.
+
+        Args:
+            meshes: Undeformed implant, or one a name; they make masks exact. Without, registered nodes are taken.
+            pitch: Of the nodes made of meshes, mm.
+
+        Raises:
+            ValueError: If nothing says what an implant is made of, or there is neither mesh nor node.
+        """
+        named = {self.implants[0].name: meshes} if isinstance(meshes, trimesh.Trimesh) else dict(meshes or {})
+        return [part for i in self.implants for part in i.known_components(named.get(i.name), pitch=pitch)]
+
+    def beam(self) -> Beam:
+        """The beam that the registration found, as hard as it found it, with the attenuation of the known components.
+
+        Raises:
+            ValueError: If DRRs were plain path lengths, or the result has no scene.
+        """
+        model = self._scene().intensity
+        if not isinstance(model, PolyenergeticTransmission) or model.beam.sources is not None:
+            raise ValueError("the registration had no beam of one spectrum: name the implant's material")
+        names = [name for i in self.implants for name in (i.material, *(screw.material for screw in i.screws))]
+        rows = [model.material_names.index(name) for name in dict.fromkeys(names) if name is not None]
+        return model.beam.behind(float(model.hardness.detach()), rows)
+
+    @torch.no_grad()
+    def scatter(self, transmission: Tensor, geometry: ConeBeamGeometry, *, mask: Tensor | None = None) -> Tensor:
+        """Scatter (V, rows, cols) in units of the open beam, as the registration found it, of any views of the scan.
+
+        Args:
+            transmission: Measured intensity over the open beam's, shape (V, rows, cols).
+            geometry: The views.
+            mask: 0 where a pixel holds no measurement.
+        """
+        data = RegistrationData.of_transmission(geometry, transmission, mask)
+        levels = torch.tensor([[self.intensity.get(name, 0.0) for name in ("scatter", "scatter_removed")]])
+        return scattered_signal(levels, data.with_scatter_shapes(self.config.scatter_mm).scatter_shapes)[0]
+
+    def _scene(self) -> Scene:
         if self.scene is None:
-            raise ValueError("the result has no scene to project: it was read from files")
-        return self.scene(geometry)
+            raise ValueError("the result was read from a run folder, which keeps no nodes of the implants; save() does")
+        return self.scene
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the result with its scene, for :meth:`load`.
+
+        Raises:
+            ValueError: If a parameter is not finite, or the result has no scene.
+        """
+        content = {"result": self.to_dict(), "history": self.history, "scene": scene_to_dict(self._scene())}
+        temporary = f"{os.fspath(path)}.part"
+        torch.save(content, temporary)
+        os.replace(temporary, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> RegistrationResult:
+        """What :meth:`save` wrote; nothing in the file is executed.
+
+        Raises:
+            ValueError: If the file is none, or damaged.
+            FileNotFoundError: If there is none.
+        """
+        try:
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        except FileNotFoundError:
+            raise
+        except Exception as error:  # torch.load fails in many ways on a damaged file
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise ValueError(f"result {path} cannot be read: {reason[:120]}") from error
+        require_keys(content, ("result", "history", "scene"), f" of result {path}")
+        result = cls.from_dict(content["result"], history=content["history"])
+        result.scene = scene_from_dict(content["scene"])
+        for implant, assembly in zip(result.implants, result.scene, strict=True):
+            implant.cloud = assembly.implant
+        return result
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types and tensors, all that :meth:`from_dict` needs to warp any point as the result does.
+
+        Raises:
+            ValueError: If a parameter is not finite.
+            NotImplementedError: If a deformation is of a model that cannot be written.
+        """
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "units": "mm",
+            "implants": [implant.to_dict() for implant in self.implants],
+            "intensity": self.intensity,
+            "gc": self.gc.tolist(),
+            "seed": self.seed,
+            "status": self.status,
+            "warnings": self.warnings,
+            "diagnostics": self.diagnostics,
+            "stages": self.stages,
+            "config": self.config.model_dump(mode="json"),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Any, *, history: list[dict[str, Any]] | None = None) -> RegistrationResult:
+        """The result that :meth:`to_dict` described, in float64; it warps points to the same positions.
+
+        Args:
+            content: The dict; of format version 1 or 2.
+            history: Records of the iterations, where they are at hand.
+
+        Raises:
+            ValueError: If a key is missing or malformed, or the format is a later one; the message names it.
+        """
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            got = content.get("format") if isinstance(content, dict) else content
+            raise ValueError(f"must be a {FORMAT!r}, got {got!r}")
+        content = upgraded(content) if content.get("format_version") == 1 else content
+        if content.get("format_version") != FORMAT_VERSION:
+            raise ValueError(f"format_version must be at most {FORMAT_VERSION}, got {content.get('format_version')!r}")
+        require_keys(content, ("implants", "gc", "config"))
+        if not isinstance(content["implants"], list) or not content["implants"]:
+            raise ValueError("implants must be a list of one or more")
+        return cls(
+            implants=[RegisteredImplant.from_dict(implant) for implant in content["implants"]],
+            gc=torch.tensor([float("nan") if value is None else float(value) for value in content["gc"]]),
+            history=list(history or []),
+            config=RegistrationConfig.model_validate(content["config"]),
+            seed=int(content.get("seed", 0)),
+            status=content.get("status", "ok"),
+            diagnostics=dict(content.get("diagnostics", {})),
+            stages=list(content.get("stages", [])),
+            warnings=[str(text) for text in content.get("warnings", [])],
+            intensity={
+                name: finite_number(value, f"intensity parameter {name}")
+                for name, value in content.get("intensity", {}).items()
+            },
+        )
 
     def __repr__(self) -> str:
         gc = " ".join(f"{value:.3f}" for value in self.gc.tolist())

@@ -1,23 +1,28 @@
 """What is in the beam and what is seen of it: implants with their poses, deformations and components (`Assembly`), the
 scene they make, which renders itself, the measured images, and all that may be changed to make both agree."""
 
-from .assembly import Assembly, followed_points
+from .assembly import Assembly, followed_motion
 from .background import with_background
 from .data import RegistrationData
+from .known_component import KnownComponent
 from .moves import Moves, screw_path
+from .saved import scene_from_dict, scene_to_dict
 from .scene import Scene
 from .state import Placement, State
 from .view import View
 
 __all__ = [
     "Assembly",
+    "KnownComponent",
     "Moves",
     "Placement",
     "RegistrationData",
     "Scene",
     "State",
     "View",
-    "followed_points",
+    "followed_motion",
+    "scene_from_dict",
+    "scene_to_dict",
     "screw_path",
     "with_background",
 ]

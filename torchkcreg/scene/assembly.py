@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -120,8 +120,7 @@ class Assembly(ExactModule):
 
     def motion_at(self, head: Tensor) -> Tensor:
         """Rigid motion (4, 4) in the implant's frame of a component whose head is there, a point (3,)."""
-        points = followed_points(self.implant.points, head, self.follow_radius_mm)
-        return fit_rigid(points, points + self.deformation.displacement(points))
+        return followed_motion(self.implant.points, head, self.follow_radius_mm, self.deformation)
 
     @torch.no_grad()
     def component_motions(self) -> dict[str, Tensor]:
@@ -171,6 +170,12 @@ class Assembly(ExactModule):
     def extra_repr(self) -> str:
         """Name, material and what is fixed to it."""
         return f"name={self.name!r}, material={self.material!r}, components={len(self.components)}"
+
+
+def followed_motion(points: Tensor, head: Tensor, radius: float, moved: Callable[[Tensor], Tensor]) -> Tensor:
+    """Rigid motion (4, 4) of a part whose head is fixed to an implant of points (N, 3) that something moves."""
+    followed = followed_points(points, head, radius)
+    return fit_rigid(followed, moved(followed))
 
 
 def followed_points(points: Tensor, head: Tensor, radius: float) -> Tensor:

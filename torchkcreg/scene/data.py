@@ -16,6 +16,7 @@ from torchkcreg.physics import scatter_shapes
 
 from .following import resized
 
+_LEAST_TRANSMISSION = 1e-6
 _SCATTER_BLOCK = 8  # scatter is smooth: its shape is found on blocks of this many pixels squared
 
 
@@ -67,6 +68,14 @@ class RegistrationData:
         if lines.dtype not in (torch.float32, torch.float64):
             lines = lines.to(torch.float32)
         object.__setattr__(self, "line_integrals", lines)
+
+    @classmethod
+    def of_transmission(
+        cls, geometry: ConeBeamGeometry, transmission: Tensor, mask: Tensor | None = None
+    ) -> RegistrationData:
+        """Of measured intensities over the open beam's, (V, rows, cols), floored where nothing arrives."""
+        lines = -transmission.clamp_min(_LEAST_TRANSMISSION).log()
+        return cls(geometry, lines, mask)  # type: ignore[arg-type]
 
     @property
     def num_views(self) -> int:

@@ -1,0 +1,38 @@
+"""Deformations out of the plain types that files hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchkcreg.deformation.ffd import FreeFormDeformation
+from torchkcreg.deformation.linear import RigidDeformation
+from torchkcreg.deformation.model import Deformation
+from torchkcreg.plain import finite_array, require_keys
+from torchkcreg.splines import ControlPointGrid
+
+
+def deformation_from_dict(content: Any) -> Deformation:
+    """The deformation that `Deformation.to_dict` described, in float64; a new model is a line in the table below.
+
+    Raises:
+        ValueError: a key is missing or malformed; the message names it.
+    """
+    require_keys(content, ("model",), " of a deformation")
+    if content["model"] not in _READERS:
+        raise ValueError(f"model must be one of {', '.join(_READERS)}, got {content['model']!r}")
+    return _READERS[content["model"]](content)
+
+
+def _free_form(content: dict[str, Any]) -> FreeFormDeformation:
+    require_keys(content, ("grid", "control_points_mm", "labels"), " of a deformation")
+    grid = content["grid"]
+    require_keys(grid, ("shape", "spacing_mm", "grid_to_implant"), " of the grid")
+    nx, ny, nz = (int(n) for n in finite_array(grid["shape"], (3,), "shape of the grid").tolist())
+    sx, sy, sz = finite_array(grid["spacing_mm"], (3,), "spacing_mm of the grid").tolist()
+    frame = finite_array(grid["grid_to_implant"], (4, 4), "grid_to_implant")
+    points = finite_array(content["control_points_mm"], (nx, ny, nz, 3), "control_points_mm")
+    labels = finite_array(content["labels"], (nx, ny, nz), "labels").long()
+    return FreeFormDeformation(ControlPointGrid((nx, ny, nz), (sx, sy, sz), frame), points.double(), labels)
+
+
+_READERS = {"ffd": _free_form, "rigid": lambda content: RigidDeformation()}
