@@ -84,14 +84,15 @@ def _check_folder(out: Path, overwrite: bool) -> None:
 def _write_case(folder: Path, case: SimulatedCase) -> RegistrationFiles:
     """Files that a registration reads, and the beads' positions, of a simulated case."""
     folder.mkdir(parents=True, exist_ok=True)
+    mesh = folder / "implant.stl"
     files = RegistrationFiles(
-        implant=folder / "implant.stl",
+        implant=mesh,
         geometry=folder / "geometry.json",
         projections=folder / "projections.npz",
         components=folder / "screws.json",
         spectrum=folder / "spectrum.csv",
     )
-    write_mesh(files.implant, case.implant)
+    write_mesh(mesh, case.implant)
     write_geometry(files.geometry, case.geometry)
     write_projections(files.projections, intensity=case.intensity, open_beam=case.open_beam)
     write_components(folder / "screws.json", case.screws)

@@ -106,7 +106,8 @@ def evaluate_files(
 def _implant_of(run_folder: Path) -> Path:
     """The mesh that a run was started with."""
     files = read_config(Path(run_folder) / "config.yaml").get("files")
-    path = files.get("implant") if isinstance(files, dict) else None
+    named = files.get("implant") if isinstance(files, dict) else None
+    path: str | None = named[0] if isinstance(named, list) and named else named  # type: ignore[assignment]
     if path is None or not Path(path).is_file():
         where = "names none" if path is None else f"names {path}, which is not there"
         raise FileNotFoundError(f"the implant's undeformed mesh is needed, and run folder {run_folder} {where}")

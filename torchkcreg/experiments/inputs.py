@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import transform_points
-from torchkcreg.implant import Component, Hole, ImplantPointCloud, find_holes
+from torchkcreg.implant import Component, ImplantPointCloud, find_holes
 from torchkcreg.io import (
     implausible_magnification,
     read_components,
@@ -25,7 +26,8 @@ from torchkcreg.io import (
 )
 from torchkcreg.kernels import choose_backend
 from torchkcreg.physics import Spectrum, material
-from torchkcreg.registration import RegistrationConfig, RegistrationData
+from torchkcreg.registration import Implant, RegistrationConfig
+from torchkcreg.scene import RegistrationData
 
 _FEWEST_NODES_ALONG = 4
 _FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
@@ -33,7 +35,7 @@ _FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
 
 @dataclass(frozen=True)
 class RegistrationFiles:
-    """The files of a registration.
+    """The files of a registration; of several implants, lists of as many entries, None where there is none.
 
     Attributes:
         implant: Closed mesh of the undeformed implant, mm.
@@ -42,20 +44,65 @@ class RegistrationFiles:
         spectrum: Detected spectrum; None takes a 90 kV tungsten spectrum where a material is named.
         components: Screws that move with the implant.
         init: Approximate pose.
+        materials: Of each of several implants, where they are not of one.
         views: Views to use; None takes all.
         open_beam: Unattenuated intensity where the projections' file does not say it.
         config: Options as YAML or JSON.
     """
 
-    implant: Path
+    implant: Path | Sequence[Path]
     geometry: Path
     projections: Path
     spectrum: Path | None = None
-    components: Path | None = None
-    init: Path | None = None
+    components: Path | Sequence[Path | None] | None = None
+    init: Path | Sequence[Path | None] | None = None
+    materials: Sequence[str] | None = None
     views: list[int] | None = None
     open_beam: float | None = None
     config: Path | None = None
+
+    def each(self) -> list[ImplantFiles]:
+        """The files of each implant.
+
+        Raises:
+            ValueError: If there are not as many of a kind as there are implants.
+        """
+        meshes = [self.implant] if isinstance(self.implant, Path) else list(self.implant)
+        names = [mesh.stem for mesh in meshes] if len(meshes) > 1 else ["implant"]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            times = names.count(twice[0])
+            raise ValueError(f"implants are named after their files, but {twice[0]} is there {times} times")
+        return [
+            ImplantFiles(*one)
+            for one in zip(
+                names,
+                meshes,
+                _for_each(self.components, len(meshes), "components"),
+                _for_each(self.init, len(meshes), "init"),
+                _for_each(self.materials, len(meshes), "material"),
+                strict=True,
+            )
+        ]
+
+
+@dataclass(frozen=True)
+class ImplantFiles:
+    """The files of one implant, see :class:`RegistrationFiles`."""
+
+    name: str
+    mesh: Path
+    components: Path | None
+    init: Path | None
+    material: str | None
+
+
+def _for_each(given: Any, number: int, what: str) -> list[Any]:
+    listed = [given] if given is None or isinstance(given, (str, Path)) else list(given)
+    if given is None:
+        return [None] * number
+    if len(listed) != number:
+        raise ValueError(f"{number} implants need as many {what}, got {len(listed)}; - stands for none")
+    return listed
 
 
 @dataclass(frozen=True)
@@ -63,22 +110,22 @@ class RegistrationInputs:
     """What the files hold.
 
     Attributes:
-        implant: Nodes of the undeformed implant.
+        implants: Each undeformed implant with its components, holes and start pose.
         data: Projections and geometry of the views to use.
-        components: Screws and the like.
-        holes: Round holes of the implant.
         spectrum: Detected spectrum, where one was given.
-        implant_to_world: Start pose (4, 4), where one was given.
         warnings: What a user should know about them, a line each.
     """
 
-    implant: ImplantPointCloud
+    implants: list[Implant]
     data: RegistrationData
-    components: list[Component]
-    holes: list[Hole]
     spectrum: Spectrum | None
-    implant_to_world: Tensor | None
     warnings: list[str]
+
+    @property
+    def starts(self) -> list[Tensor]:
+        """Start pose (4, 4) of each implant."""
+        still = torch.eye(4, dtype=torch.float64)
+        return [still if i.implant_to_world is None else i.implant_to_world for i in self.implants]
 
 
 def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationInputs:
@@ -90,25 +137,38 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
     """
     _check_options(files, config)
     with _noted() as notes:
+        each = files.each()
         data = _read_data(files, config)
         spectrum = read_spectrum(files.spectrum) if files.spectrum else None
-        screws = read_components(files.components) if files.components else []
-        pose = read_init(files.init) if files.init else None
-        mesh = read_mesh(files.implant)
-        _check_size(files.implant, mesh, config.pitch_mm)
-        components = [Component.of(screw, pitch=config.pitch_mm) for screw in screws]
-        implant = ImplantPointCloud.from_mesh(mesh, config.pitch_mm)
-        holes = find_holes(mesh)
-        placed = implant.points if pose is None else transform_points(pose, implant.points.double())
-        if (doubt := implausible_magnification(data.facing(placed).geometry, placed)) is not None:
-            warnings.warn(doubt, stacklevel=2)
-    return RegistrationInputs(implant, data, components, holes, spectrum, pose, notes)
+        implants = [_read_implant(one, config) for one in each]
+        for one in implants:
+            points, pose = one.cloud.points, one.implant_to_world
+            placed = points if pose is None else transform_points(pose, points.double())
+            if (doubt := implausible_magnification(data.facing(placed).geometry, placed)) is not None:
+                warnings.warn(doubt, stacklevel=2)
+    return RegistrationInputs(implants, data, spectrum, notes)
+
+
+def _read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
+    screws = read_components(files.components) if files.components else []
+    pose = read_init(files.init) if files.init else None
+    mesh = read_mesh(files.mesh)
+    _check_size(files.mesh, mesh, config.pitch_mm)
+    return Implant(
+        ImplantPointCloud.from_mesh(mesh, config.pitch_mm),
+        components=[Component.of(screw, pitch=config.pitch_mm) for screw in screws],
+        holes=find_holes(mesh),
+        implant_to_world=pose,
+        material=files.material,
+        name=files.name,
+    )
 
 
 def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:
     choose_backend(torch.empty(0), config.backend)
     if config.material is not None:
-        material(config.material)
+        for name in (config.material, *(files.materials or ())):
+            material(name)
     elif files.spectrum is not None:
         raise ValueError("a spectrum needs the implant's material: name it with --material")
     views = files.views or []

@@ -104,14 +104,7 @@ def prepared_trainer(inputs: RegistrationInputs, config: RegistrationConfig) -> 
     Raises:
         ValueError: If the implant lies outside every view.
     """
-    scene = build_scene(
-        inputs.implant,
-        config,
-        spectrum=inputs.spectrum,
-        components=inputs.components,
-        implant_to_world=inputs.implant_to_world,
-        holes=inputs.holes,
-    )
+    scene = build_scene(inputs.implants, config, spectrum=inputs.spectrum)
     trainer = Trainer(scene, inputs.data, config, callbacks=[ProgressBar()])
     trainer.check()
     return trainer
@@ -138,12 +131,12 @@ def write_run(
     more_metrics: dict[str, Any] | None = None,
 ) -> None:
     """Nothing; writes metrics, figures and the result of a finished registration to its run folder."""
-    initial = torch.eye(4, dtype=torch.float64) if inputs.implant_to_world is None else inputs.implant_to_world
-    run.write_metrics({**_metrics(result, trainer.scene, [initial], seconds), **(more_metrics or {})})
+    starts = inputs.starts
+    run.write_metrics({**_metrics(result, trainer.scene, starts, seconds), **(more_metrics or {})})
     if figures:
-        for name, figure in draw_registration(result, trainer.data, [initial]).items():
+        for name, figure in draw_registration(result, trainer.data, starts).items():
             run.write_figure(name, figure)
-    run.write_result(result, [inputs.implant.points], initial_to_world=[initial])
+    run.write_result(result, [implant.cloud.points for implant in inputs.implants], initial_to_world=starts)
 
 
 class _Checkpoints(Callback):
@@ -167,9 +160,15 @@ class _Checkpoints(Callback):
 
 def run_record(files: RegistrationFiles, config: RegistrationConfig) -> dict[str, Any]:
     """What config.yaml keeps: files, options and the stages that they resolve to."""
-    names = {k: str(v.resolve()) if isinstance(v, Path) else v for k, v in vars(files).items() if v is not None}
+    names = {key: _recorded(value) for key, value in vars(files).items() if value is not None}
     schedule = [stage.model_dump(mode="json") for stage in config.schedule()]
     return {"files": names, "options": config.model_dump(mode="json"), "schedule": schedule}
+
+
+def _recorded(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value.resolve())
+    return [_recorded(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
 def _continue(run: RunFolder, trainer: Trainer, record: dict[str, Any]) -> None:

@@ -25,13 +25,17 @@ def registered_components(
         FileNotFoundError: the run is not finished, or a file it was made from is gone.
     """
     result, files = read_run(run), read_config(Path(run) / "config.yaml").get("files") or {}
+    meshes = [files["implant"]] if isinstance(files["implant"], str) else files["implant"]
     screws = None if components is None else read_components(components)
-    try:
-        return result.implants[0].known_components(
-            read_mesh(files["implant"]),
-            screws=screws,
-            material=material,
-            pitch=pitch_mm or result.config.pitch_mm,
-        )
-    except ValueError as error:
-        raise ValueError(f"run {run}: {error} with --material") from None
+    if screws is not None and len(meshes) > 1:
+        raise ValueError(f"run {run} has {len(meshes)} implants: screws cannot be named for all of them at once")
+    known = []
+    for implant, mesh in zip(result.implants, meshes, strict=True):
+        try:
+            own = implant.known_components(
+                read_mesh(mesh), screws=screws, material=material, pitch=pitch_mm or result.config.pitch_mm
+            )
+        except ValueError as error:
+            raise ValueError(f"run {run}: {error} with --material") from None
+        known += own
+    return known

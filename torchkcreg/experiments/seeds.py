@@ -14,7 +14,7 @@ from torch import Tensor
 from torchkcreg.io import RunFolder
 from torchkcreg.registration import RegistrationResult, Trainer
 
-from .inputs import RegistrationFiles, read_inputs
+from .inputs import RegistrationFiles, RegistrationInputs, read_inputs
 from .register_files import prepared_trainer, resolve_config, run_record, train, write_run
 
 LARGEST_SPREAD_MM = 0.02
@@ -106,7 +106,7 @@ def register_seeds(
         write_run(folder, results[-1], trainers[-1], inputs, seconds=time.perf_counter() - begin, figures=False)
     losses = tuple(float(result.history[-1]["loss"]) for result in results)
     best = losses.index(min(losses))
-    nodes = torch.stack([result.warp(inputs.implant.points) for result in results])
+    nodes = torch.stack([_all_nodes(result, inputs) for result in results])
     seeds, distances = tuple(r.seed for r in results), tuple(distances_from_mean(nodes).tolist())
     result, trainer = results[best], trainers[best]
     runs = SeedRuns(result, seeds, losses, distances)
@@ -117,6 +117,11 @@ def register_seeds(
     seconds = time.perf_counter() - start
     write_run(run, result, trainer, inputs, seconds=seconds, figures=figures, more_metrics=more)
     return runs
+
+
+def _all_nodes(result: RegistrationResult, inputs: RegistrationInputs) -> Tensor:
+    """World positions (N, 3) of all implants' nodes."""
+    return torch.cat([i.warp(given.cloud.points) for i, given in zip(result.implants, inputs.implants, strict=True)])
 
 
 def distances_from_mean(nodes: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,12 +12,13 @@ from typing import NoReturn
 import torchkcreg
 from torchkcreg.console import one_line, run_command
 
+from .command import add_command
+from .register import add_register
+
 # Before torch starts its threads. Between small operations they wait by spinning for a few microseconds: asleep at
 # once, they double the time of a registration; spinning for long, they stop each other where other programs run.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
-
-_FAILED = 3  # exit status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,7 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="torchkcreg", description=torchkcreg.__doc__)
     parser.add_argument("--version", action="version", version=f"torchkcreg {torchkcreg.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_register(commands)
+    add_register(commands)
     _add_warp(commands)
     _add_evaluate(commands)
     _add_reconstruct(commands)
@@ -54,88 +54,35 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _command(commands, name: str, run, text: str) -> argparse.ArgumentParser:
-    command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    command.set_defaults(run=run)
-    command.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    return command
-
-
-def _add_register(commands) -> None:
-    command = _command(commands, "register", _register, "measure the deformation of an implant in a few projections")
-    command.add_argument("--implant", type=Path, required=True, help="closed mesh of the undeformed implant (mm)")
-    command.add_argument("--geometry", type=Path, required=True, help="projection matrices (JSON)")
-    command.add_argument("--projections", type=Path, required=True, help="intensities or line integrals (NPZ, MHA)")
-    command.add_argument("--out", type=Path, required=True, help="run folder to make")
-    command.add_argument("--views", type=_integers, help="views to use, such as 15,16,17 (default: all)")
-    command.add_argument("--material", help="material of the implant, such as steel: polyenergetic DRRs")
-    command.add_argument("--spectrum", type=Path, help="detected spectrum: energy in keV, weight (CSV)")
-    command.add_argument("--components", type=Path, help="screws that move with the implant (JSON)")
-    command.add_argument("--init", type=Path, help="approximate implant_to_world (JSON)")
-    command.add_argument("--open-beam", type=float, help="unattenuated intensity, where the file does not say it")
-    command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
-    command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")
-    command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
-    command.add_argument("--seed", type=int, help="seed of the random numbers")
-    command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
-    command.add_argument("--backend", help="projector: auto, cpp or torch")
-    command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
-    existing = command.add_mutually_exclusive_group()
-    existing.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
-    existing.add_argument("--resume", action="store_true", help="continue the run that the folder holds")
-
-
-def _integers(text: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"views must be integers separated by commas, got {text!r}") from None
-
-
-def _register(options: argparse.Namespace) -> int:
-    from torchkcreg.experiments import RegistrationFiles, register_files, register_seeds
-
-    if options.seeds is not None and options.resume:
-        raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")
-    files = RegistrationFiles(**{name: getattr(options, name) for name in RegistrationFiles.__dataclass_fields__})
-    names = ("material", "preset", "pitch_mm", "seed", "backend")
-    overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    how = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}
-    if options.seeds is not None:
-        runs = register_seeds(files, options.out, options.seeds, **how)
-        result = runs.result
-        print(runs)
-    else:
-        result = register_files(files, options.out, resume=options.resume, **how)
-    similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())
-    print(f"{result.status}: gradient correlation of each view {similarity}; run folder {options.out}")
-    return _FAILED if result.status == "failed" else 0
-
-
 def _add_warp(commands) -> None:
-    command = _command(commands, "warp", _warp, "move points of the undeformed implant's frame to the world")
+    command = add_command(commands, "warp", _warp, "move points of the undeformed implant's frame to the world")
     command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
     command.add_argument("--points", type=Path, required=True, help="x,y,z in the implant's frame, mm (CSV)")
     command.add_argument("--out", type=Path, required=True, help="CSV to write: x,y,z in the world, outside or not")
+    command.add_argument("--implant-name", help="of several implants, the one whose frame the points are in (its file)")
 
 
 def _warp(options: argparse.Namespace) -> None:
     from torchkcreg.io import read_points, read_run, write_points
 
     result, points = read_run(options.run_folder), read_points(options.points)
-    outside = result.outside(points)
+    try:
+        implant = result.implant(options.implant_name)
+    except KeyError as error:
+        raise ValueError(f"run folder {options.run_folder}: {error.args[0]}") from None
+    outside = implant.outside(points)
     if outside.any():
         warnings.warn(
             f"{int(outside.sum())} of {len(points)} points lie beyond the control points: "
             "they move rigidly with the nearest group",
             stacklevel=1,
         )
-    write_points(options.out, result.warp(points), outside=outside)
+    write_points(options.out, implant.warp(points), outside=outside)
 
 
 def _add_evaluate(commands) -> None:
     text = "compare a registration with known positions, or with the implant's true shape"
-    command = _command(commands, "evaluate", _evaluate, text)
+    command = add_command(commands, "evaluate", _evaluate, text)
     command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
     command.add_argument("--points", type=Path, help="x,y,z before, in the implant's frame (CSV)")
     command.add_argument("--truth", type=Path, help="x,y,z of the same points after, in the world (CSV)")
@@ -160,7 +107,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _add_reconstruct(commands) -> None:
-    command = _command(commands, "reconstruct", _reconstruct, "make a volume from a scan: FDK, PWLS or KC-Rec")
+    command = add_command(commands, "reconstruct", _reconstruct, "make a volume from a scan: FDK, PWLS or KC-Rec")
     command.add_argument("--method", choices=("fdk", "pwls", "kcrec"), default="fdk", help="default: fdk")
     command.add_argument("--run", type=Path, dest="run_folder", help="registration: the implant, and files not given")
     command.add_argument("--geometry", type=Path, help="projection matrices of all views (JSON)")
@@ -213,7 +160,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
 
 
 def _add_info(commands) -> None:
-    command = _command(commands, "info", _info, "say what a file or a run folder holds, or what is installed")
+    command = add_command(commands, "info", _info, "say what a file or a run folder holds, or what is installed")
     command.add_argument("paths", type=Path, nargs="*", help="meshes, geometries, projections, run folders")
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, where projections do not say it")
 
@@ -228,7 +175,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _add_demo(commands) -> None:
-    command = _command(commands, "demo", _demo, "simulate a loaded plate, register it, evaluate and draw the result")
+    command = add_command(commands, "demo", _demo, "simulate a loaded plate, register it, evaluate and draw the result")
     command.add_argument("--out", type=Path, default=Path("demo"), help="folder to make")
     command.add_argument("--seed", type=int, default=0, help="seed of the simulated noise")
     command.add_argument("--overwrite", action="store_true", help="replace the demo that the folder holds")
@@ -238,7 +185,3 @@ def _demo(options: argparse.Namespace) -> None:
     from torchkcreg.experiments import demo
 
     demo(options.out, seed=options.seed, overwrite=options.overwrite)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
