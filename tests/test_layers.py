@@ -102,3 +102,27 @@ def test_the_files_of_a_folder_stand_on_few_levels_and_in_no_circle(folder):
 def test_a_file_has_one_subject_and_stays_short(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 260
     assert path.name != "utils.py"
+
+
+FACTORIES = {"arange", "empty", "eye", "full", "linspace", "ones", "rand", "randn", "tensor", "zeros"}
+ON_ANY_DEVICE = ("deformation", "optimization", "projector", "registration", "scene", "similarity", "splines")
+
+
+def without_device(path: Path) -> list[str]:
+    """Calls of torch's factories that name no device, and casts to single precision."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+            continue
+        of_torch = isinstance(node.func.value, ast.Name) and node.func.value.id == "torch"
+        if of_torch and node.func.attr in FACTORIES and all(keyword.arg != "device" for keyword in node.keywords):
+            found.append(f"{path.name}:{node.lineno} torch.{node.func.attr} without a device")
+        if node.func.attr == "float" and not node.args and not of_torch:
+            found.append(f"{path.name}:{node.lineno} .float(): images have the data's precision")
+    return found
+
+
+@pytest.mark.parametrize("folder", ON_ANY_DEVICE)
+def test_tensors_are_made_on_a_device_that_is_named_and_images_in_the_datas_precision(folder):
+    found = [line for path in sorted((PACKAGE / folder).glob("*.py")) for line in without_device(path)]
+    assert not found, "\n".join(found)

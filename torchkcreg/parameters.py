@@ -28,9 +28,9 @@ class ParameterBlock:
         """Names of parameters that now are within a share of their range of a bound; none by default."""
         return []
 
-    def at_rest(self) -> Tensor:
+    def at_rest(self, device: torch.device | str = "cpu") -> Tensor:
         """The step (1, D) that changes nothing."""
-        return torch.zeros(1, self.num_parameters, dtype=torch.float64)
+        return torch.zeros(1, self.num_parameters, dtype=torch.float64, device=device)
 
 
 class ParameterBlocks(Mapping[str, ParameterBlock]):
@@ -85,6 +85,6 @@ class ParameterBlocks(Mapping[str, ParameterBlock]):
         """Names of parameters that now are within a share of their range of a bound."""
         return [name for block in self._blocks.values() for name in block.at_bounds(share)]
 
-    def at_rest(self) -> Tensor:
+    def at_rest(self, device: torch.device | str = "cpu") -> Tensor:
         """The step (1, D) that changes nothing."""
-        return torch.cat([block.at_rest() for block in self._blocks.values()], dim=-1)
+        return torch.cat([block.at_rest(device) for block in self._blocks.values()], dim=-1)

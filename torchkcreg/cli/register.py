@@ -32,6 +32,7 @@ def add_register(commands) -> None:
     command.add_argument("--seed", type=int, help="seed of the random numbers")
     command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
     command.add_argument("--backend", help="projector: auto, cpp or torch")
+    command.add_argument("--device", help="where it is computed: cpu (default), cuda, cuda:1, ...")
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
     existing = command.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
@@ -63,7 +64,7 @@ def _register(options: argparse.Namespace) -> int:
     each = {name: _only(getattr(options, name)) for name in ("implant", "components", "init")}
     materials = options.material if options.material and len(options.material) > 1 else None
     files = RegistrationFiles(**each, materials=materials, **{name: getattr(options, name) for name in named})
-    names = ("preset", "pitch_mm", "seed", "backend")
+    names = ("preset", "pitch_mm", "seed", "backend", "device")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     overrides |= {"material": options.material[0]} if options.material else {}
     how = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}

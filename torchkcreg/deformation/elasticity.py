@@ -34,7 +34,7 @@ class Elasticity:
     def of_filling(self) -> Elasticity:
         """The same for a solid that fills the grid's valid domain, one node a cell."""
         cells = self.grid.positions()[1:-2, 1:-2, 1:-2].reshape(-1, 3)
-        spacing = torch.tensor(self.grid.spacing, dtype=torch.float64)
+        spacing = torch.tensor(self.grid.spacing, dtype=torch.float64, device=self.grid.frame.device)
         middles = transform_points(self.grid.frame, cells + spacing / 2)
         return Elasticity(self.grid, self.labels, middles, spacing.prod().expand(len(middles)))
 
@@ -45,7 +45,7 @@ class Elasticity:
 
     def gradients(self, steps: Tensor) -> Tensor:
         """Deformation gradients (K, N, 3, 3)."""
-        return torch.eye(3).to(steps) + (self.slopes @ steps[:, None]).mT
+        return torch.eye(3, dtype=steps.dtype, device=steps.device) + (self.slopes @ steps[:, None]).mT
 
     def energy(self, steps: Tensor) -> Tensor:
         """Mean energy density over Young's modulus, shape (K,); half a squared strain."""
@@ -54,7 +54,7 @@ class Elasticity:
     def strains(self, steps: Tensor) -> Tensor:
         """Green-Lagrange strains, (K, 9 N), so weighted that half their squares sum to the energy."""
         gradients = self.gradients(steps)
-        strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(steps))
+        strain = 0.5 * (gradients.mT @ gradients - torch.eye(3, dtype=steps.dtype, device=steps.device))
         return (strain * self.share[:, None, None]).flatten(1)
 
     def displacements(self, steps: Tensor) -> Tensor:

@@ -118,7 +118,7 @@ def motion_coefficients(rotations: Tensor, translations: Tensor) -> Tensor:
         rotations: of the groups about their centres, (..., G, 3, 3).
         translations: of the groups' centres, mm, (..., G, 3).
     """
-    turns = (rotations - torch.eye(3).to(rotations)).mT
+    turns = (rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).mT
     return torch.cat([translations[..., None, :], turns], dim=-2).flatten(-3, -2)
 
 
@@ -139,7 +139,7 @@ def control_points_from_groups(
     _check_motions(rotations, translations, len(centers))
     group = labels.flatten()
     arms = grid.positions().to(translations).reshape(-1, 3) - centers[group]
-    turns = (rotations - torch.eye(3).to(rotations))[..., group, :, :]
+    turns = (rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device))[..., group, :, :]
     phi = (turns @ arms[:, :, None]).squeeze(-1) + translations[..., group, :]
     return phi.unflatten(-2, grid.shape)
 

@@ -36,7 +36,7 @@ class LinearDeformation(Deformation):
 
     def __init__(self, num_amounts: int) -> None:
         super().__init__()
-        self.amounts = nn.Parameter(torch.zeros(num_amounts, dtype=torch.float64))
+        self.amounts = nn.Parameter(torch.zeros(num_amounts, dtype=torch.float64, device="cpu"))
 
     def shapes(self, points: Tensor) -> Tensor:
         """Displacements (..., N, M, 3) of points (..., N, 3) by an amount of one of each shape, mm."""
@@ -103,7 +103,9 @@ class LinearMotion(Motion):
     def coefficients(self, steps: Tensor) -> Tensor:
         """t, then R - I, then q_m R for each shape."""
         rotation, turned = self._rotation(steps), self._rotation(steps).mT
-        rigid = torch.cat([steps[:, None, 3:6], turned - torch.eye(3).to(rotation)], dim=1)
+        rigid = torch.cat(
+            [steps[:, None, 3:6], turned - torch.eye(3, dtype=rotation.dtype, device=rotation.device)], dim=1
+        )
         amounts = self._amounts(steps)
         return torch.cat([rigid, (amounts[..., None, None] * turned[:, None]).flatten(1, 2)], dim=1)
 

@@ -50,7 +50,7 @@ class ModalMotion(Motion):
         number = min(num_modes, groups.num_parameters)
         values, self.modes = _generalized_eigenvectors(stiffness, inertia, number)
         self.stiffnesses = elasticity.volume * values.clamp_min(0.0)
-        self.start = torch.zeros(self.modes.shape[1], dtype=torch.float64)
+        self.start = self.modes.new_zeros(self.modes.shape[1])
         in_grid = displacement.double() @ groups.grid.frame[:3, :3].to(displacement.device)
         wanted = (in_grid * elasticity.share[:, None]).flatten()
         along = self.modes.T @ moves
@@ -98,7 +98,7 @@ class ModalMotion(Motion):
 
 def _derivatives(groups: GroupMotion, elasticity: Elasticity) -> tuple[Tensor, Tensor, Tensor]:
     """At rest: those (P, S) of the displacements, and the second ones (P, P) of their mean square and of the energy."""
-    offsets = _DIFFERENCE_MM * torch.eye(groups.num_parameters, dtype=torch.float64)
+    offsets = _DIFFERENCE_MM * torch.eye(groups.num_parameters, dtype=torch.float64, device=groups.centers.device)
     ahead, behind = groups.in_grid(offsets), groups.in_grid(-offsets)
     moves = (elasticity.displacements(ahead) - elasticity.displacements(behind)) / (2 * _DIFFERENCE_MM)
     strains = (elasticity.strains(ahead) - elasticity.strains(behind)) / (2 * _DIFFERENCE_MM)

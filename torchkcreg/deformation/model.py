@@ -93,7 +93,13 @@ class Deformation(nn.Module, ABC):
     def jacobian(self, points: Tensor) -> Tensor:
         """Jacobians (..., N, 3, 3) of x -> x + u(x), [i, j] = d (x + u)_i / d x_j; central differences by default."""
         points, step = points.double(), 1e-3
-        sides = torch.stack([points + s * step * axis for axis in torch.eye(3).to(points) for s in (1, -1)])
+        sides = torch.stack(
+            [
+                points + s * step * axis
+                for axis in torch.eye(3, dtype=points.dtype, device=points.device)
+                for s in (1, -1)
+            ]
+        )
         moved = self.forward(sides).unflatten(0, (3, 2))
         return ((moved[:, 0] - moved[:, 1]) / (2 * step)).movedim(0, -1)
 

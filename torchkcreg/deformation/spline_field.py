@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -50,6 +51,11 @@ class SplineField(Deformation):
         self.control_points = nn.Parameter(control_points.detach().clone())
         self.register_buffer("labels", labels.long().clone())
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SplineField:
+        super()._apply(fn, recurse)
+        self.grid = self.grid.to(self.control_points.device)
+        return self
+
     def displacement(self, points: Tensor) -> Tensor:
         """Displacements u, mm, of points (..., N, 3) in the implant's frame; see `spline_displacement`."""
         return spline_displacement(self.grid, self.control_points, points, labels=self.labels)
@@ -61,7 +67,9 @@ class SplineField(Deformation):
         orders = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
         slopes = [basis.evaluate(features, o) / s for o, s in zip(orders, self.grid.spacing, strict=True)]
         frame = self.grid.frame[:3, :3].to(points)
-        jacobian = torch.eye(3).to(points) + frame @ torch.stack(slopes, dim=-1) @ frame.T
+        jacobian = (
+            torch.eye(3, dtype=points.dtype, device=points.device) + frame @ torch.stack(slopes, dim=-1) @ frame.T
+        )
         return jacobian.reshape(*points.shape, 3)
 
     def outside(self, points: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ def strain_energy(gradients: Tensor, volumes: Tensor, *, poisson: float = 0.0) -
     """
     if not 0 <= poisson < 0.5:
         raise ValueError(f"poisson must be from 0 up to, but not including, 0.5, got {poisson}")
-    strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(gradients))
+    strain = 0.5 * (gradients.mT @ gradients - torch.eye(3, dtype=gradients.dtype, device=gradients.device))
     first = poisson / ((1 + poisson) * (1 - 2 * poisson))
     trace = strain.diagonal(dim1=-2, dim2=-1).sum(-1)
     density = 0.5 * first * trace**2 + 0.5 / (1 + poisson) * strain.square().sum((-2, -1))

@@ -165,7 +165,7 @@ def _read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
 
 
 def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:
-    choose_backend(torch.empty(0), config.backend)
+    choose_backend(_device(config.device), config.backend)
     if config.material is not None:
         for name in (config.material, *(files.materials or ())):
             material(name)
@@ -174,6 +174,15 @@ def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None
     views = files.views or []
     if twice := sorted({view for view in views if views.count(view) > 1}):
         raise ValueError(f"views must be distinct, got view {twice[0]} {views.count(twice[0])} times")
+
+
+def _device(name: str) -> Tensor:
+    """An empty tensor on a device; ValueError where there is no such one."""
+    try:
+        return torch.empty(0, device=name)
+    except (RuntimeError, AssertionError, ValueError) as error:  # torch's own way to say so depends on the device
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"device {name!r} is not to be had: {reason[:120]}") from error
 
 
 def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationData:

@@ -104,8 +104,8 @@ def prepared_trainer(inputs: RegistrationInputs, config: RegistrationConfig) -> 
     Raises:
         ValueError: If the implant lies outside every view.
     """
-    scene = build_scene(inputs.implants, config, spectrum=inputs.spectrum)
-    trainer = Trainer(scene, inputs.data, config, callbacks=[ProgressBar()])
+    scene = build_scene(inputs.implants, config, spectrum=inputs.spectrum).to(config.device)
+    trainer = Trainer(scene, inputs.data.to(config.device), config, callbacks=[ProgressBar()])
     trainer.check()
     return trainer
 
@@ -115,7 +115,8 @@ def train(
 ) -> RegistrationResult:
     """The result of a trainer whose checkpoints go to a run folder; its warnings begin with those of the inputs."""
     trainer.callbacks += [_Checkpoints(run), *callbacks]
-    result = trainer.fit()
+    result = trainer.fit().to("cpu")
+    trainer.data = trainer.data.to("cpu")
     result.warnings[:0] = inputs.warnings
     return result
 

@@ -17,7 +17,8 @@ def checked_shape(det_shape: Sequence[int]) -> tuple[int, int]:
 
 def checked_matrices(matrices: Tensor) -> Tensor:
     """Projection matrices (V, 3, 4) in float64 with unit normals in row 2; ValueError where they are none."""
-    matrices = torch.as_tensor(matrices).double()
+    given = matrices if isinstance(matrices, Tensor) else torch.as_tensor(matrices, device="cpu")
+    matrices = given.double()
     if matrices.ndim != 3 or tuple(matrices.shape[1:]) != (3, 4) or len(matrices) == 0:
         raise ValueError(f"projection_matrices must have shape (V, 3, 4), got {tuple(matrices.shape)}")
     if not bool(matrices.isfinite().all()):

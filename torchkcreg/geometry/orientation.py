@@ -69,7 +69,7 @@ def _meeting_point(matrices: Tensor, det_shape: tuple[int, int]) -> Tensor | Non
     sources = -(inverse @ matrices[:, :, 3:]).squeeze(-1)
     along = inverse @ middle
     along = along / along.norm(dim=-1, keepdim=True)
-    across = torch.eye(3).to(matrices) - along[:, :, None] * along[:, None, :]
+    across = torch.eye(3, dtype=matrices.dtype, device=matrices.device) - along[:, :, None] * along[:, None, :]
     mean = across.mean(0)
     if float(torch.linalg.eigvalsh(mean)[0]) < _LEAST_ANGLE**2:
         return None

@@ -112,7 +112,7 @@ def across(axis: Tensor) -> Tensor:
     >>> across(torch.tensor([0.0, 0.0, 1.0])).abs().tolist()
     [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     """
-    other = torch.eye(3).to(axis)[int(axis.abs().argmin())]
+    other = torch.eye(3, dtype=axis.dtype, device=axis.device)[int(axis.abs().argmin())]
     first = torch.linalg.cross(axis, other)
     first = first / first.norm()
     return torch.stack([first, torch.linalg.cross(axis, first)])

@@ -57,7 +57,7 @@ class Component(nn.Module):
     @classmethod
     def of(cls, screw: Screw, *, pitch: float = 0.25, dtype: torch.dtype = torch.float32) -> Component:
         """A screw as a cylinder of solid material from the centre of its head to its tip."""
-        start, end = (torch.tensor(point, dtype=dtype) for point in (screw.start, screw.end))
+        start, end = (torch.tensor(point, dtype=dtype, device="cpu") for point in (screw.start, screw.end))
         return cls(screw.name, screw.cloud(pitch, dtype=dtype), screw.material, start, end - start, screw=screw)
 
     @classmethod

@@ -28,5 +28,5 @@ def deformed_surface(
     if not longest_edge_mm > 0:
         raise ValueError(f"longest_edge_mm must be positive, got {longest_edge_mm}")
     fine, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest_edge_mm, max_iter=20)
-    vertices = warp(torch.tensor(fine, dtype=torch.float64)).detach().cpu().numpy()
+    vertices = warp(torch.tensor(fine, dtype=torch.float64, device="cpu")).detach().cpu().numpy()
     return trimesh.Trimesh(vertices, faces, process=False)

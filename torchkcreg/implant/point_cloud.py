@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -65,6 +65,11 @@ class ImplantPointCloud(nn.Module):
         self.register_buffer("volumes", volumes.to(points)[order])
         self.register_buffer("cell", cell.to(points))
         self._coarser: dict[tuple[int, ...], ImplantPointCloud] = {}
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ImplantPointCloud:
+        self._coarser = {}
+        super()._apply(fn, recurse)
+        return self
 
     @classmethod
     def from_mesh(

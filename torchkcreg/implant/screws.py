@@ -80,13 +80,13 @@ class Screw:
 
     def moved(self, rotation: Tensor, shift: Tensor) -> Screw:
         """The screw, turned about its start by a rotation vector (3,) and then shifted by a vector (3,), mm."""
-        ends = torch.tensor([self.start, self.end], dtype=torch.float64)
+        ends = torch.tensor([self.start, self.end], dtype=torch.float64, device="cpu")
         turned = transform_points(rotation_about(ends[0], rotation.cpu().double()), ends) + shift.cpu().double()
         return replace(self, start=tuple(turned[0].tolist()), end=tuple(turned[1].tolist()))
 
     def moved_by(self, motion: Tensor) -> Screw:
         """The screw after a rigid motion (4, 4)."""
-        ends = torch.tensor([self.start, self.end], dtype=torch.float64)
+        ends = torch.tensor([self.start, self.end], dtype=torch.float64, device="cpu")
         start, end = transform_points(motion.detach().cpu().double(), ends).tolist()
         return replace(self, start=tuple(start), end=tuple(end))
 
@@ -101,10 +101,10 @@ class Screw:
     def stretched_cloud(self, pitch: float) -> ImplantPointCloud:
         """Its nodes, those of a common screw stretched: in no time, but on a lattice of its own."""
         common = _common_cloud(pitch)
-        start, end = (torch.tensor(p, dtype=torch.float64) for p in (self.start, self.end))
+        start, end = (torch.tensor(p, dtype=torch.float64, device="cpu") for p in (self.start, self.end))
         axis = (end - start) / (end - start).norm()
         thicker, longer = self.radius / _COMMON_RADIUS_MM, self.length / _COMMON_LENGTH_MM
-        stretch = torch.tensor([[thicker], [thicker], [longer]]) * torch.cat([across(axis), axis[None]])
+        stretch = axis.new_tensor([[thicker], [thicker], [longer]]) * torch.cat([across(axis), axis[None]])
         volumes = common.volumes * (thicker**2 * longer)
         return ImplantPointCloud(start + common.points @ stretch, volumes, common.cell @ stretch)
 

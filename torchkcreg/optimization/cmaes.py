@@ -63,7 +63,7 @@ class CMAES(Optimizer):
         """Tells a new strategy all of them again."""
         self.__init__(self.problem, self.stage, self.seed)  # type: ignore[misc]
         for losses in state["losses"]:
-            self.tell(self.ask(), torch.tensor(losses, dtype=torch.float64))
+            self.tell(self.ask(), torch.tensor(losses, dtype=torch.float64, device=self.problem.device))
 
     def _bounded(self, candidates: np.ndarray) -> Tensor:
         return self.problem.project(torch.as_tensor(candidates, dtype=torch.float64, device=self.problem.device))

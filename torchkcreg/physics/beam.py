@@ -78,9 +78,9 @@ class Beam(ExactModule):
         several = {"": spectrum} if isinstance(spectrum, Spectrum) else dict(spectrum)
         kept = [s if num_bins is None else s.reduced(materials, num_bins) for s in several.values()]
         energies = [energy for one in kept for energy in one.energies_kev]
-        weights = torch.block_diag(*(torch.tensor([one.weights], dtype=torch.float64) for one in kept))
+        weights = torch.block_diag(*(torch.tensor([one.weights], dtype=torch.float64, device="cpu") for one in kept))
         return cls(
-            torch.tensor(energies, dtype=torch.float64),
+            torch.tensor(energies, dtype=torch.float64, device="cpu"),
             weights[0] if isinstance(spectrum, Spectrum) else weights,
             torch.stack([m.attenuation(energies) for m in materials]),
             sources=None if isinstance(spectrum, Spectrum) else list(several),

@@ -203,7 +203,7 @@ class PolyenergeticTransmission(IntensityModel):
 
 def _parameter(value: float) -> nn.Parameter:
     """A scalar float64 parameter."""
-    return nn.Parameter(torch.tensor(float(value), dtype=torch.float64))
+    return nn.Parameter(torch.tensor(float(value), dtype=torch.float64, device="cpu"))
 
 
 def _check_path_lengths(path_lengths: Tensor, num_materials: int | None, pooling: int) -> None:

@@ -70,7 +70,8 @@ class Material:
         Raises:
             ValueError: If an energy lies outside the table.
         """
-        asked = torch.as_tensor(energies_kev, dtype=torch.float64)
+        device = energies_kev.device if isinstance(energies_kev, Tensor) else "cpu"
+        asked = torch.as_tensor(energies_kev, dtype=torch.float64, device=device)
         table = torch.tensor(self.energies_kev, dtype=torch.float64, device=asked.device)
         if asked.numel() and not bool(((asked >= table[0]) & (asked <= table[-1])).all()):
             low, high = float(asked.min()), float(asked.max())

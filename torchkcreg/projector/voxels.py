@@ -226,7 +226,8 @@ def _checked_matrices(grid: VolumeGrid, matrices: Tensor, data: Tensor) -> Tenso
     if bool((torch.linalg.det(matrices[:, :, :3] / normals.clamp_min(1e-300)).abs() < 1e-9).any()):
         raise ValueError("projection_matrices must have an invertible left 3 x 3 part")
     matrices = matrices / normals[:, 2:]
-    center = grid.voxel_to_world[:3] @ torch.tensor([*((n - 1) / 2 for n in grid.shape[::-1]), 1.0]).double()
+    to_world = grid.voxel_to_world
+    center = to_world[:3] @ to_world.new_tensor([*((n - 1) / 2 for n in grid.shape[::-1]), 1.0])
     depth = matrices[:, 2, :3] @ center.to(matrices.device) + matrices[:, 2, 3]
     return torch.where(depth < 0, -1.0, 1.0)[:, None, None] * matrices
 

@@ -166,6 +166,7 @@ class RegistrationConfig(BaseModel):
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp" or "torch".
+        device: Where files are registered: "cpu", "cuda", "cuda:1", ...; in Python the data's own device decides.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -190,7 +191,8 @@ class RegistrationConfig(BaseModel):
     screw_materials: tuple[str, ...] = ("steel", "titanium")
     follow_radius_mm: float = Field(8.0, gt=0)
     seed: int = 0
-    backend: Literal["auto", "cpp", "torch"] = "auto"
+    backend: str = "auto"
+    device: str = "cpu"
 
     @field_validator("stages")
     @classmethod

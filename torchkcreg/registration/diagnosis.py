@@ -91,7 +91,9 @@ def node_deviation(objective: Objective, parameters: Tensor) -> float:
     shares = 0.5 / objective.images.num_views * shares
     blocks = max(int((shares != 0).any(0).sum()), 2)
     inner = blocks / (blocks - 1) * shares @ shares.T
-    floor = 1e-9 * curvature.diagonal().mean() * torch.eye(len(curvature)).to(curvature)
+    floor = (
+        1e-9 * curvature.diagonal().mean() * torch.eye(len(curvature), dtype=curvature.dtype, device=curvature.device)
+    )
     bread = torch.linalg.inv(curvature + floor)
     moves = _node_moves(objective, parameters)
     return float(torch.einsum("sd,de,se->", moves, bread @ inner @ bread, moves).clamp_min(0).sqrt())
@@ -104,6 +106,6 @@ def _block_sums(images: Tensor, size: int) -> Tensor:
 
 def _node_moves(objective: Objective, parameters: Tensor) -> Tensor:
     """Derivatives (S, D) of the nodes' displacements, weighted so that their squares sum to the mean square."""
-    offsets = _DIFFERENCE_MM * torch.eye(len(parameters)).to(parameters)
+    offsets = _DIFFERENCE_MM * torch.eye(len(parameters), dtype=parameters.dtype, device=parameters.device)
     ahead, behind = (objective.moves.displacements(parameters + s * offsets) for s in (1, -1))
     return ((ahead - behind) / (2 * _DIFFERENCE_MM)).T

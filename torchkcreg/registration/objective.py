@@ -53,7 +53,7 @@ class Objective:
     @property
     def at_rest(self) -> Tensor:
         """The candidate (1, D) that leaves the scene as it is."""
-        return self.moves.at_rest().to(self.device)
+        return self.moves.at_rest(self.device)
 
     def project(self, parameters: Tensor) -> Tensor:
         """Candidates with all parameters inside their bounds."""
@@ -105,7 +105,7 @@ class Objective:
     @torch.no_grad()
     def jacobian(self, parameters: Tensor, step_mm: float = 0.01) -> tuple[Tensor, Tensor]:
         """Derivatives (D, V, 2, rows, cols) of the residual images, and those (V, 2, rows, cols)."""
-        offsets = step_mm * torch.eye(self.num_parameters).to(parameters)
+        offsets = step_mm * torch.eye(self.num_parameters, dtype=parameters.dtype, device=parameters.device)
         center = self._residuals(parameters[None])
         steps = [(self._residuals(parameters + o) - center) / step_mm for o in offsets.split(self._batch())]
         return torch.cat(steps), center[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -61,6 +61,16 @@ class RegisteredImplant:
             cloud=assembly.implant,
         )
 
+    def to(self, device: torch.device | str) -> RegisteredImplant:
+        """The implant on a device; its modules are moved, not copied."""
+        return replace(
+            self,
+            implant_to_world=self.implant_to_world.to(device),
+            deformation=self.deformation.to(device),
+            components={name: motion.to(device) for name, motion in self.components.items()},
+            cloud=None if self.cloud is None else self.cloud.to(device),
+        )
+
     @torch.no_grad()
     def displacement(self, points: Tensor) -> Tensor:
         """u (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64 and that frame."""
@@ -97,7 +107,7 @@ class RegisteredImplant:
         own = self.cloud.points if nodes is None and self.cloud is not None else nodes
         if own is None:
             raise ValueError(f"screw {screw.name} was not registered, and there are no nodes of the implant to follow")
-        head = torch.tensor(screw.start, dtype=torch.float64)
+        head = self.implant_to_world.new_tensor(screw.start)
         return followed_motion(own, head, self.follow_radius_mm, self.warp)
 
     def known_components(

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-import trimesh
 from torch import Tensor
 
-from torchkcreg.deformation import Deformation
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.implant import Screw
 from torchkcreg.physics import Beam, PolyenergeticTransmission, scattered_signal
 from torchkcreg.plain import finite_number, require_keys
-from torchkcreg.scene import KnownComponent, RegistrationData, Scene, scene_from_dict, scene_to_dict
+from torchkcreg.scene import RegistrationData, Scene, scene_from_dict, scene_to_dict
 
 from .config import RegistrationConfig
 from .earlier import upgraded
 from .registered_implant import RegisteredImplant
+from .registered_implants import RegisteredImplants
 from .verdict import Status
 
 FORMAT = "torchkcreg deformation"
@@ -28,7 +25,7 @@ FORMAT_VERSION = 2
 
 
 @dataclass
-class RegistrationResult:
+class RegistrationResult(RegisteredImplants):
     """What a registration found.
 
     Attributes:
@@ -58,53 +55,6 @@ class RegistrationResult:
     intensity: dict[str, float] = field(default_factory=dict)
     scene: Scene | None = field(default=None, repr=False)
 
-    def implant(self, name: str | None = None) -> RegisteredImplant:
-        """The implant of a name; the first one without.
-
-        Raises:
-            KeyError: If there is none of that name.
-        """
-        found = [i for i in self.implants if name in (None, i.name)]
-        if not found:
-            raise KeyError(f"no implant {name!r}: there are {', '.join(i.name for i in self.implants)}")
-        return found[0]
-
-    @property
-    def implant_to_world(self) -> Tensor:
-        """Of the first implant."""
-        return self.implants[0].implant_to_world
-
-    @property
-    def deformation(self) -> Deformation:
-        """Of the first implant."""
-        return self.implants[0].deformation
-
-    @property
-    def screws_found(self) -> list[Screw]:
-        """Screws that were found, not given, each in its implant's frame before the motion."""
-        return [screw for implant in self.implants for screw in implant.screws if screw.name in implant.found]
-
-    def warp(self, points: Tensor, *, implant: str | None = None) -> Tensor:
-        """World positions (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64.
-
-        Points beyond the control-point grid move rigidly with the nearest group; :meth:`outside` flags them.
-        """
-        return self.implant(implant).warp(points)
-
-    def displacement(self, points: Tensor, *, implant: str | None = None) -> Tensor:
-        """Bending u (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in that frame."""
-        return self.implant(implant).displacement(points)
-
-    def outside(self, points: Tensor, *, implant: str | None = None) -> Tensor:
-        """True for points (..., 3) beyond the valid domain of the control-point grid."""
-        return self.implant(implant).outside(points)
-
-    def deformed(
-        self, mesh: trimesh.Trimesh, *, implant: str | None = None, longest_edge_mm: float = 4.0
-    ) -> trimesh.Trimesh:
-        """A mesh of the undeformed implant's frame, bent and in its place in the world; long edges are split first."""
-        return self.implant(implant).deformed(mesh, longest_edge_mm=longest_edge_mm)
-
     @torch.no_grad()
     def project(self, geometry: ConeBeamGeometry) -> Tensor:
         """Line integrals (V, rows, cols) of the registered implants and their components in any views.
@@ -113,21 +63,6 @@ class RegistrationResult:
             ValueError: If the result was read from a run folder, which does not keep the implants' nodes.
         """
         return self._scene()(geometry)
-
-    def known_components(
-        self, meshes: trimesh.Trimesh | Mapping[str, trimesh.Trimesh] | None = None, *, pitch: float = 0.25
-    ) -> list[KnownComponent]:
-        """The bent implants and their screws as metal in its place: what KC-Rec takes.
-
-        Args:
-            meshes: Undeformed implant, or one a name; they make masks exact. Without, registered nodes are taken.
-            pitch: Of the nodes made of meshes, mm.
-
-        Raises:
-            ValueError: If nothing says what an implant is made of, or there is neither mesh nor node.
-        """
-        named = {self.implants[0].name: meshes} if isinstance(meshes, trimesh.Trimesh) else dict(meshes or {})
-        return [part for i in self.implants for part in i.known_components(named.get(i.name), pitch=pitch)]
 
     def beam(self) -> Beam:
         """The beam that the registration found, as hard as it found it, with the attenuation of the known components.
@@ -152,8 +87,15 @@ class RegistrationResult:
             mask: 0 where a pixel holds no measurement.
         """
         data = RegistrationData.of_transmission(geometry, transmission, mask)
-        levels = torch.tensor([[self.intensity.get(name, 0.0) for name in ("scatter", "scatter_removed")]])
+        levels = transmission.new_tensor([[self.intensity.get(name, 0.0) for name in ("scatter", "scatter_removed")]])
         return scattered_signal(levels, data.with_scatter_shapes(self.config.scatter_mm).scatter_shapes)[0]
+
+    def to(self, device: torch.device | str) -> RegistrationResult:
+        """The result, moved to a device."""
+        if self.scene is not None:
+            self.scene.to(device)
+        self.gc, self.implants = self.gc.to(device), [implant.to(device) for implant in self.implants]
+        return self
 
     def _scene(self) -> Scene:
         if self.scene is None:
@@ -237,7 +179,7 @@ class RegistrationResult:
             raise ValueError("implants must be a list of one or more")
         return cls(
             implants=[RegisteredImplant.from_dict(implant) for implant in content["implants"]],
-            gc=torch.tensor([float("nan") if value is None else float(value) for value in content["gc"]]),
+            gc=torch.tensor([float("nan") if x is None else float(x) for x in content["gc"]], device="cpu"),
             history=list(history or []),
             config=RegistrationConfig.model_validate(content["config"]),
             seed=int(content.get("seed", 0)),

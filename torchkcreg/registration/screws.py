@@ -139,5 +139,5 @@ def _along(hole: Hole, side: float, material: str) -> Screw:
 
 def _shifted(screw: Screw, start: tuple[float, float, float]) -> Screw:
     """The screw, moved as a whole until it starts there."""
-    still = torch.zeros(3, dtype=torch.float64)
-    return screw.moved(still, torch.tensor(start, dtype=torch.float64) - torch.tensor(screw.start, dtype=torch.float64))
+    x, y, z = (end + there - here for end, there, here in zip(screw.end, start, screw.start, strict=True))
+    return replace(screw, start=start, end=(x, y, z))

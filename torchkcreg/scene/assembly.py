@@ -65,13 +65,20 @@ class Assembly(ExactModule):
         self.name, self.material, self.holes = name, material, list(holes)
         self.follow_radius_mm = follow_radius_mm
         device = implant.points.device
-        pose = torch.eye(4, dtype=torch.float64) if implant_to_world is None else implant_to_world.detach().clone()
+        still = torch.eye(4, dtype=torch.float64, device=device)
+        pose = still if implant_to_world is None else implant_to_world.detach().clone()
         if pose.shape != (4, 4):
             raise ValueError(f"implant_to_world must have shape (4, 4), got {tuple(pose.shape)}")
         self.register_buffer("implant_to_world", pose.to(device, torch.float64))
         self.register_buffer("tilts", torch.zeros(0, 3, dtype=torch.float64, device=device), persistent=False)
         self.found: list[Screw] = []
+        self.followed: list[Tensor] = []
         self._set_components(components)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Assembly:
+        super()._apply(fn, recurse)
+        self.followed = [points.to(self.implant_to_world.device) for points in self.followed]
+        return self
 
     def place(self, screws: Sequence[Screw]) -> None:
         """Makes screws, with nodes as far apart as the implant's, the only components."""
@@ -133,7 +140,7 @@ class Assembly(ExactModule):
         """Root mean square of the strain in the implant."""
         cloud = self.implant.coarsened_to(_NODES_PITCH_MM)
         gradients = self.deformation.jacobian(cloud.points.double())
-        strain = 0.5 * (gradients.mT @ gradients - torch.eye(3).to(gradients))
+        strain = 0.5 * (gradients.mT @ gradients - torch.eye(3, dtype=gradients.dtype, device=gradients.device))
         share = (cloud.volumes / cloud.volumes.sum()).double()
         return float((strain.square().sum((-2, -1)) * share).sum().sqrt())
 

@@ -91,10 +91,10 @@ class Moves(ParameterBlocks):
     def shift(self, number: int, direction: Tensor) -> Tensor:
         """The step (D,) that shifts an assembly, by its number, by 1 mm along a direction (3,) of its own frame."""
         part, name, direction = self.parts[number], f"motion of {self.parts[number].name}", direction.double()
-        offsets = _DIFFERENCE_MM * torch.eye(self[name].num_parameters).to(direction)
+        offsets = _DIFFERENCE_MM * torch.eye(self[name].num_parameters, dtype=torch.float64, device=direction.device)
         slopes = (part.displacements(offsets) - part.displacements(-offsets)) / (2 * _DIFFERENCE_MM)
         wanted = (part.share * direction).flatten()
-        steps = {name: block.at_rest()[0].to(direction) for name, block in self.items()}
+        steps = {name: block.at_rest(direction.device)[0] for name, block in self.items()}
         steps[name] = torch.linalg.lstsq(slopes.T, wanted[:, None]).solution[:, 0]
         return torch.cat(list(steps.values()))
 
@@ -140,5 +140,5 @@ class _Part:
 @torch.no_grad()
 def screw_path(assembly: Assembly, view: View, screw: Screw) -> Tensor:
     """Path lengths (V, rows, cols) in mm of a screw where an assembly now has it."""
-    motion = assembly.motion_at(torch.tensor(screw.start, dtype=torch.float64))
+    motion = assembly.motion_at(assembly.implant_to_world.new_tensor(screw.start))
     return view.cloud_path_lengths(screw.stretched_cloud(_SCREW_PITCH_MM), assembly.implant_to_world @ motion)

@@ -109,7 +109,7 @@ class _Evaluate(_Splines):
     @staticmethod
     def jvp(ctx: Any, along: Tensor | None, tangent: Tensor | None, *_: None) -> Tensor:
         eta, features = ctx.saved_tensors
-        total = torch.zeros((), dtype=features.dtype)
+        total = features.new_zeros(())
         if tangent is not None:
             total = total + _Evaluate.apply(eta, tangent, ctx.blocks, ctx.orders)
         if along is not None:
@@ -143,7 +143,7 @@ class _Scatter(_Splines):
     @staticmethod
     def jvp(ctx: Any, along: Tensor | None, tangent: Tensor | None, *_: None) -> Tensor:
         eta, values = ctx.saved_tensors
-        total = torch.zeros((), dtype=values.dtype)
+        total = values.new_zeros(())
         if tangent is not None:
             total = total + _Scatter.apply(eta, tangent, ctx.blocks, ctx.orders, *ctx.sizes)
         if along is not None:

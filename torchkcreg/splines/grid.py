@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -43,12 +44,18 @@ class ControlPointGrid:
             raise ValueError(f"shape must hold three numbers of control points, each at least 4, got {self.shape}")
         if len(spacing) != 3 or not all(0 < s < math.inf for s in spacing):
             raise ValueError(f"spacing must hold three positive lengths in mm, got {self.spacing}")
-        frame = torch.as_tensor(self.frame).detach().to(torch.float64)
+        frame = self.frame.detach().to(torch.float64)
         if frame.shape != (4, 4) or not _is_rigid(frame):
             raise ValueError(f"frame must be a rigid (4, 4) transform, got shape {tuple(frame.shape)} {frame.tolist()}")
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "spacing", spacing)
         object.__setattr__(self, "frame", frame)
+
+    def to(self, device: torch.device | str) -> ControlPointGrid:
+        """The grid with its frame on another device."""
+        moved = copy.copy(self)
+        object.__setattr__(moved, "frame", self.frame.to(device))
+        return moved
 
     @property
     def num_control_points(self) -> int:
@@ -57,8 +64,11 @@ class ControlPointGrid:
 
     def positions(self) -> Tensor:
         """CPs in the grid's frame, mm, shape (nx, ny, nz, 3), float64."""
-        axes = [torch.arange(n, dtype=torch.float64) * s for n, s in zip(self.shape, self.spacing, strict=True)]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).to(self.frame.device)
+        axes = [
+            torch.arange(n, dtype=torch.float64, device=self.frame.device) * s
+            for n, s in zip(self.shape, self.spacing, strict=True)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
     def to_dict(self) -> dict[str, Any]:
         """Shape, spacing and frame, for files."""
@@ -115,7 +125,7 @@ def default_grid(
         max(int(least), math.ceil(extent / step - 1e-9) + 5)
         for least, extent, step in zip(shape, (high - low).tolist(), spacing, strict=True)
     ]
-    size = torch.tensor([(n - 1) * s for n, s in zip(counts, spacing, strict=True)]).to(points)
+    size = points.new_tensor([(n - 1) * s for n, s in zip(counts, spacing, strict=True)])
     frame = torch.eye(4, dtype=torch.float64, device=points.device)
     frame[:3, :3] = axes
     frame[:3, 3] = axes @ ((low + high - size) / 2)
@@ -134,8 +144,8 @@ def _principal_axes(points: Tensor) -> Tensor:
 
 def _is_rigid(frame: Tensor) -> bool:
     rotation = frame[:3, :3]
-    identity = torch.eye(3).to(frame)
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(frame)
+    identity = torch.eye(3, dtype=frame.dtype, device=frame.device)
+    last = frame.new_tensor([0.0, 0.0, 0.0, 1.0])
     return bool(
         torch.isfinite(frame).all()
         and torch.allclose(rotation.T @ rotation, identity, atol=1e-6)
