@@ -2,6 +2,7 @@ import pytest
 import torch
 import trimesh
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import VolumeGrid, circular_geometry
 from torchkcreg.physics import material, tungsten_spectrum
 from torchkcreg.reconstruction import (
@@ -102,11 +103,12 @@ def test_a_run_stopped_in_its_second_pass_resumes_to_the_same_volume(scan):
     options = {"config": config, "components": [component], "passes": 2}
     kept = {}
 
-    def keep(index, solver, record):
-        if index == 1 and record["iteration"] == 1:
-            kept.update({"pass": index, "solver": solver.state_dict(), "volume": solver.initial})
+    class Keeps(Callback):
+        def on_iteration(self, run, index, progress):
+            if index == 1 and progress["iteration"] == 1:
+                kept.update({"pass": index, "solver": run.state_dict(), "volume": run.initial})
 
-    whole = reconstruct(with_bar, geometry, GRID, beam, callback=keep, **options)
+    whole = reconstruct(with_bar, geometry, GRID, beam, callbacks=[Keeps()], **options)
     resumed = reconstruct(with_bar, geometry, GRID, beam, state=kept, **options)
     assert torch.equal(resumed.volume, whole.volume)
 

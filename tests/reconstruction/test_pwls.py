@@ -1,8 +1,10 @@
 import math
+from typing import ClassVar
 
 import pytest
 import torch
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import MultisourceScanner, VolumeGrid, circular_geometry
 from torchkcreg.reconstruction import PWLS, PWLSConfig, VoxelSystem, pwls, statistical_weights
 from torchkcreg.reconstruction.roughness import roughness_gradient
@@ -99,9 +101,20 @@ def test_what_is_masked_sends_no_ray_and_is_filled_smoothly(problem):
 
 
 def test_callbacks_see_each_iteration(problem):
-    seen = []
-    solve(problem, PWLSConfig(iterations=3, subsets=2)).run(lambda solver, record: seen.append(record["iteration"]))
-    assert seen == [1, 2, 3]
+    class Notes(Callback):
+        seen: ClassVar[list] = []
+
+        def on_stage_start(self, run, index, stage):
+            self.seen.append(stage.iterations)
+
+        def on_iteration(self, run, index, progress):
+            self.seen.append((index, progress["iteration"], run.iteration))
+
+        def on_stage_end(self, run, index, stage):
+            self.seen.append("end")
+
+    solve(problem, PWLSConfig(iterations=2, subsets=2)).run(callbacks=[Notes()], number=4)
+    assert Notes.seen == [2, (4, 1, 1), (4, 2, 2), "end"]
 
 
 def test_presets_are_the_paper_and_a_tenth_of_it():

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 import torch.distributed as distributed
-from pydantic import ValidationError
 from torch import Tensor
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.io import RunFolder, read_config, read_volume, write_volume
 from torchkcreg.physics import material
 from torchkcreg.reconstruction import (
@@ -48,11 +48,7 @@ def resolve_options(overrides: dict[str, Any], config: Path | None = None) -> Re
         ValueError: For unknown keys and wrong values, in one line that names them.
     """
     options = read_config(config) if config is not None else {}
-    try:
-        return ReconstructionOptions.model_validate({**options, **overrides})
-    except ValidationError as error:
-        problems = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
-        raise ValueError(f"options: {'; '.join(problems)}") from None
+    return ReconstructionOptions.of({**options, **overrides}, f"config {config}" if config else "options")
 
 
 def reconstruct_files(
@@ -132,19 +128,22 @@ def _reconstructed(
         initial=initial,
         shard=shard,
         backend=backend,
-        callback=None if run is None else _checkpoints(run, config.iterations),
+        callbacks=[] if run is None else [_Checkpoints(run, config.iterations)],
         state=state,
         progress=None if run is not None else False,
     )
     return result.volume, result.history
 
 
-def _checkpoints(run: RunFolder, iterations: int) -> Callable[[int, PWLS, dict[str, Any]], None]:
-    def keep(index: int, solver: PWLS, record: dict[str, Any]) -> None:
-        if record["iteration"] % CHECKPOINT_EVERY == 0 or record["iteration"] == iterations:
-            run.save_checkpoint({"pass": index, "solver": solver.state_dict(), "volume": solver.initial})
+class _Checkpoints(Callback):
+    """Writes a checkpoint every few iterations, and at the end of a pass."""
 
-    return keep
+    def __init__(self, folder: RunFolder, iterations: int) -> None:
+        self.folder, self.iterations = folder, iterations
+
+    def on_iteration(self, run: PWLS, index: int, progress: dict[str, Any]) -> None:
+        if progress["iteration"] % CHECKPOINT_EVERY == 0 or progress["iteration"] == self.iterations:
+            self.folder.save_checkpoint({"pass": index, "solver": run.state_dict(), "volume": run.initial})
 
 
 def _metrics(

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 
+from torchkcreg.config import Config
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.io import read_config, read_geometry, read_projections, read_spectrum
 from torchkcreg.physics import Spectrum, material, tungsten_spectrum
@@ -50,7 +51,7 @@ class ReconstructionFiles:
     initial: Path | None = None
 
 
-class ReconstructionOptions(BaseModel):
+class ReconstructionOptions(Config):
     """Options of a reconstruction; unknown keys are refused.
 
     Attributes:
@@ -71,8 +72,6 @@ class ReconstructionOptions(BaseModel):
         material: The implant's, where the registration had none.
         backend: Projector: "auto", "cpp" or "torch".
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     method: Literal["fdk", "pwls", "kcrec"] = "fdk"
     spacing_mm: float = Field(0.8, gt=0)

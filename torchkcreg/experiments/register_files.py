@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 from torch import Tensor
 
 from torchkcreg.geometry import transform_points
@@ -43,12 +42,7 @@ def resolve_config(path: Path | None, overrides: dict[str, Any]) -> Registration
     options = read_config(path) if path else {}
     if options.keys() == RECORD_KEYS and isinstance(options["options"], dict):
         options = options["options"]
-    try:
-        return RegistrationConfig.model_validate({**options, **overrides})
-    except ValidationError as error:
-        problems = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
-        source = f"config {path}" if path else "options"
-        raise ValueError(f"{source}: {'; '.join(problems)}") from None
+    return RegistrationConfig.of({**options, **overrides}, f"config {path}" if path else "options")
 
 
 def register_files(
@@ -144,18 +138,18 @@ class _Checkpoints(Callback):
     """Writes a checkpoint after each stage, and every few seconds within one."""
 
     def __init__(self, run: RunFolder) -> None:
-        self.run, self.last = run, time.perf_counter()
+        self.folder, self.last = run, time.perf_counter()
 
-    def on_iteration(self, trainer: TrainerState, index: int, progress: Progress) -> None:
+    def on_iteration(self, run: TrainerState, index: int, progress: Progress) -> None:
         if time.perf_counter() - self.last > _CHECKPOINT_SECONDS:
-            self._save(trainer)
+            self._save(run)
 
-    def on_stage_end(self, trainer: TrainerState, index: int, stage: Stage) -> None:
-        self._save(trainer)
+    def on_stage_end(self, run: TrainerState, index: int, stage: Stage) -> None:
+        self._save(run)
 
     def _save(self, trainer: TrainerState) -> None:
-        self.run.save_checkpoint(trainer.state_dict())
-        self.run.write_history(trainer.history)
+        self.folder.save_checkpoint(trainer.state_dict())
+        self.folder.write_history(trainer.history)
         self.last = time.perf_counter()
 
 

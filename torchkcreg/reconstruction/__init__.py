@@ -20,8 +20,9 @@ from .known_component import (
     without_components,
 )
 from .preparation import PreparedData, prepare
-from .pwls import PWLS, Reconstruction, pwls
+from .pwls import PWLS, pwls
 from .pwls_config import PWLSConfig
+from .reconstructed import Reconstruction
 from .roughness import quadratic_roughness
 from .sharding import ViewShard
 from .spectral import BeamModel, background_line_integrals, behind_metal, mineral_part

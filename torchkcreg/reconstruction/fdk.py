@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchkcreg.config import Config
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.projector import backproject_weighted
 
@@ -20,8 +21,7 @@ from .sharding import ViewShard
 BLOCK_VIEWS = 16  # filtered together, to bound memory
 
 
-@dataclass(frozen=True)
-class FDKConfig:
+class FDKConfig(Config):
     """Options of `fdk`.
 
     Attributes:

@@ -3,35 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from torchkcreg.callbacks import Callback
+
 from .pwls_config import PWLSConfig
+from .reconstructed import Reconstruction
 from .roughness import quadratic_roughness, roughness_curvature, roughness_gradient
 from .sharding import ViewShard
 from .subsets import ordered_subsets
 from .system import System
 
 BLOCK_VIEWS = 16  # projected together outside of subsets, to bound memory
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """A reconstructed volume.
-
-    Attributes:
-        volume: attenuation (D, H, W), 1/mm.
-        history: one record an iteration: iteration, subsets, objective (exact where asked for, else None), estimate
-            (the objective with each subset's residual as it was met), change (RMS over the voxels, 1/mm), seconds.
-    """
-
-    volume: Tensor
-    history: list[dict[str, Any]] = field(default_factory=list)
 
 
 class PWLS:
@@ -189,22 +177,27 @@ class PWLS:
         return float(self._total(misfit))
 
     def run(
-        self, callback: Callable[[PWLS, dict[str, Any]], None] | None = None, *, progress: bool | None = False
+        self, *, callbacks: Sequence[Callback] = (), number: int = 0, progress: bool | None = False
     ) -> Reconstruction:
         """The reconstruction after all iterations that are left.
 
         Args:
-            callback: called with the solver and the record after each iteration; may keep `state_dict()`.
+            callbacks: called at the start and end, with the configuration, and after each iteration, with its record.
+            number: what they are told of this run: its number among several passes.
             progress: show a tqdm bar; None: on a terminal only.
         """
         disable = None if progress is None else not progress
+        for callback in callbacks:
+            callback.on_stage_start(self, number, self.config)
         with tqdm(total=self.config.iterations, initial=self.iteration, desc="PWLS", disable=disable) as bar:
             while self.iteration < self.config.iterations:
                 record = self.step()
                 bar.set_postfix(objective=f"{record['objective'] or record['estimate']:.6g}", refresh=False)
                 bar.update()
-                if callback is not None:
-                    callback(self, record)
+                for callback in callbacks:
+                    callback.on_iteration(self, number, record)
+        for callback in callbacks:
+            callback.on_stage_end(self, number, self.config)
         return Reconstruction(self.volume, self.history)
 
     def state_dict(self) -> dict[str, Any]:
@@ -215,7 +208,7 @@ class PWLS:
             "pace": self.pace,
             "iteration": self.iteration,
             "history": list(self.history),
-            "config": self.config.to_dict(),
+            "config": self.config.model_dump(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -224,7 +217,7 @@ class PWLS:
         Raises:
             ValueError: the state is of another configuration or volume.
         """
-        if state["config"] != self.config.to_dict():
+        if state["config"] != self.config.model_dump():
             raise ValueError("the checkpoint was made with another configuration")
         if tuple(state["volume"].shape) != tuple(self.volume.shape):
             raise ValueError(
@@ -241,7 +234,7 @@ def pwls(
     config: PWLSConfig | None = None,
     *,
     progress: bool | None = False,
-    callback: Callable[[PWLS, dict[str, Any]], None] | None = None,
+    callbacks: Sequence[Callback] = (),
     **options: Any,
 ) -> Reconstruction:
     """A PWLS reconstruction in one call; arguments as of `PWLS` and `PWLS.run`.
@@ -256,4 +249,4 @@ def pwls(
     >>> bool((system.project(result.volume, range(6)) - data).abs().max() < 0.01)
     True
     """
-    return PWLS(system, line_integrals, weights, config, **options).run(callback, progress=progress)
+    return PWLS(system, line_integrals, weights, config, **options).run(callbacks=callbacks, progress=progress)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
+
+from pydantic import Field
+
+from torchkcreg.config import Config
 
 PRESETS = ("momentum", "paper")
 
@@ -29,8 +32,7 @@ class SubsetStage:
             raise ValueError(f"subsets must be at most the number of views {num_views}, got {self.subsets}")
 
 
-@dataclass(frozen=True)
-class PWLSConfig:
+class PWLSConfig(Config):
     """Options of `pwls`.
 
     Attributes:
@@ -43,27 +45,16 @@ class PWLSConfig:
         objective_every: compute the exact objective after every so many iterations (half as much work as an iteration);
             0: never.
 
-    Raises:
-        ValueError: counts that are not positive, or a beta below zero.
-
     >>> PWLSConfig.preset("paper").stages()
     [SubsetStage(iterations=500, subsets=20, momentum=False)]
     """
 
-    iterations: int = 50
-    subsets: int = 20
+    iterations: int = Field(50, ge=1)
+    subsets: int = Field(20, ge=1)
     momentum: bool = True
-    beta: float = 10.0
+    beta: float = Field(10.0, ge=0, allow_inf_nan=False)
     nonnegative: bool = True
-    objective_every: int = 0
-
-    def __post_init__(self) -> None:
-        for name, least in (("iterations", 1), ("subsets", 1), ("objective_every", 0)):
-            value = getattr(self, name)
-            if int(value) != value or value < least:
-                raise ValueError(f"{name} must be a whole number of at least {least}, got {value}")
-        if not (math.isfinite(self.beta) and self.beta >= 0):
-            raise ValueError(f"beta must not be negative, got {self.beta}")
+    objective_every: int = Field(0, ge=0)
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> PWLSConfig:
@@ -93,7 +84,3 @@ class PWLSConfig:
                 return stage
             iteration -= stage.iterations
         return stages[-1]
-
-    def to_dict(self) -> dict[str, Any]:
-        """As plain data."""
-        return asdict(self)

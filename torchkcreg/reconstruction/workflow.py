@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.physics import Beam
 from torchkcreg.scene import KnownComponent
@@ -59,7 +60,7 @@ def reconstruct(
     blur_sigma_px: float = 0.0,
     shard: ViewShard | None = None,
     backend: str = "auto",
-    callback: Callable[[int, PWLS, dict[str, Any]], None] | None = None,
+    callbacks: Sequence[Callback] = (),
     state: dict[str, Any] | None = None,
     progress: bool | None = False,
 ) -> IterativeResult:
@@ -82,7 +83,7 @@ def reconstruct(
         blur_sigma_px: the system's blur, detector pixels.
         shard: the share of the views that this process works on.
         backend: of the projectors.
-        callback: called with the pass, the solver and the record after each iteration.
+        callbacks: called at the start and end of each pass and after each iteration; the run is the solver.
         state: where an earlier run stopped: "pass", "solver" (its state dict) and "volume", that of the pass before.
         progress: see `PWLS.run`.
     """
@@ -130,8 +131,7 @@ def reconstruct(
         )
         if state is not None and index == start and state.get("solver") is not None:
             solver.load_state_dict(state["solver"])
-        notify = None if callback is None else (lambda s, r, i=index: callback(i, s, r))
-        volume = solver.run(notify, progress=progress).volume
+        volume = solver.run(callbacks=callbacks, number=index, progress=progress).volume
         done = IterativeResult(volume, unknown, data, scatter, solver.history)
     if done is None:
         raise ValueError(f"the state is of pass {start}, but there are only {passes}")

@@ -1,9 +1,10 @@
 """Registration: the objective, its optimisers and the coarse-to-fine loop."""
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import OPTIMIZERS, Optimizer, Progress
 from torchkcreg.scene import RegistrationData, Scene, with_background
 
-from .callbacks import Callback, ProgressBar, TrainerState
+from .callbacks import ProgressBar, TrainerState
 from .config import RegistrationConfig, Stage, preset_stages
 from .objective import Objective
 from .register import Implant, build_scene, register

@@ -1,4 +1,4 @@
-"""Callbacks of a registration: progress bar, and whatever a user adds."""
+"""What callbacks of a registration may do, and the progress bar."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 from tqdm import tqdm
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import Progress
 from torchkcreg.scene import Scene
 
@@ -26,19 +27,6 @@ class TrainerState(Protocol):
         """Ends the registration after the present iteration."""
 
 
-class Callback:
-    """Base class: override what you need; every method does nothing here."""
-
-    def on_stage_start(self, trainer: TrainerState, index: int, stage: Stage) -> None:
-        """Before a stage runs."""
-
-    def on_iteration(self, trainer: TrainerState, index: int, progress: Progress) -> None:
-        """After each iteration of a stage's optimiser."""
-
-    def on_stage_end(self, trainer: TrainerState, index: int, stage: Stage) -> None:
-        """After a stage."""
-
-
 class ProgressBar(Callback):
     """A tqdm bar a stage, with the loss and the last step."""
 
@@ -46,19 +34,19 @@ class ProgressBar(Callback):
         self.disable = disable  # None: only on a terminal
         self._bar: tqdm | None = None
 
-    def on_stage_start(self, trainer: TrainerState, index: int, stage: Stage) -> None:
+    def on_stage_start(self, run: TrainerState, index: int, stage: Stage) -> None:
         """Opens the stage's bar."""
         groups = "1 group" if stage.groups == 1 else f"{stage.groups} groups"
-        name = f"stage {index + 1}/{len(trainer.stages)}: {groups}, {stage.optimizer}"
+        name = f"stage {index + 1}/{len(run.stages)}: {groups}, {stage.optimizer}"
         self._bar = tqdm(total=stage.iterations, desc=name, disable=self.disable, leave=True)
 
-    def on_iteration(self, trainer: TrainerState, index: int, progress: Progress) -> None:
+    def on_iteration(self, run: TrainerState, index: int, progress: Progress) -> None:
         """Moves the bar on."""
         if self._bar is not None:
             self._bar.set_postfix(loss=f"{progress.loss:.5f}", step_mm=f"{progress.step_mm:.4f}", refresh=False)
             self._bar.update(progress.iteration - self._bar.n)
 
-    def on_stage_end(self, trainer: TrainerState, index: int, stage: Stage) -> None:
+    def on_stage_end(self, run: TrainerState, index: int, stage: Stage) -> None:
         """Closes the bar."""
         if self._bar is not None:
             self._bar.close()

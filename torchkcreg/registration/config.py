@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from torchkcreg.config import Config
 from torchkcreg.deformation import BendingPrior, Level
 
 SimilarityName = Literal["gradient-correlation", "gradient-difference"]
@@ -14,7 +15,7 @@ PresetName = Literal["gauss-newton", "paper", "adam"]
 _COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
 
 
-class Stage(BaseModel):
+class Stage(Config):
     """One level of the coarse-to-fine schedule.
 
     Attributes:
@@ -40,8 +41,6 @@ class Stage(BaseModel):
         before: Steps before the stage's optimiser, by their names in :data:`STEPS`.
         after: Steps after it.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     groups: int = Field(1, ge=1, le=64)
     modes: int | None = Field(None, ge=6)
@@ -137,7 +136,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
     return (start, *levels)
 
 
-class RegistrationConfig(BaseModel):
+class RegistrationConfig(Config):
     """Every option of a registration but the files; unknown keys are refused.
 
     Attributes:
@@ -168,8 +167,6 @@ class RegistrationConfig(BaseModel):
         backend: Projector: "auto", "cpp" or "torch".
         device: Where files are registered: "cpu", "cuda", "cuda:1", ...; in Python the data's own device decides.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: PresetName = "gauss-newton"
     stages: tuple[Stage, ...] = ()

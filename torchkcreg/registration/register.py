@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.deformation import Deformation, FreeFormDeformation
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
 from torchkcreg.optimization import OptimizerFactory
@@ -22,7 +23,6 @@ from torchkcreg.physics import (
 from torchkcreg.scene import Assembly, RegistrationData, Scene
 from torchkcreg.splines import default_grid
 
-from .callbacks import Callback
 from .config import RegistrationConfig
 from .objective import Penalty, SimilarityFactory
 from .result import RegistrationResult

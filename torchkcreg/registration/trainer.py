@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import OPTIMIZERS, Progress
 from torchkcreg.scene import RegistrationData, Scene
 
-from .callbacks import Callback
 from .config import RegistrationConfig, Stage
 from .finish import finished
 from .guard import Guard
