@@ -1,6 +1,8 @@
+import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -80,3 +82,35 @@ def test_folders_are_there_whatever_was_touched_before():
     code = "import torchkcreg as kc; print(kc.registration.Trainer.__name__, kc.io.__name__, 'io' in dir(kc))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["Trainer", "torchkcreg.io", "True"]
+
+
+def test_the_page_on_extending_runs_from_start_to_end(capsys):
+    page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) >= 8
+    space: dict = {}
+    for block in blocks:
+        exec(compile(block, "extend.md", "exec"), space)
+    out = capsys.readouterr().out
+    assert "RegistrationResult(" in out and "('auto', 'cpp', 'torch') True False" in out
+
+
+def public_names(folder: Path) -> list[str]:
+    """The names in the `__all__` of a folder."""
+    for node in ast.parse((folder / "__init__.py").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "__all__":
+            return [element.value for element in node.value.elts]  # type: ignore[attr-defined]
+    return []
+
+
+def test_no_public_name_is_used_by_neither_the_package_nor_its_documents():
+    package = ROOT / "torchkcreg"
+    texts = [p.read_text(encoding="utf-8") for p in package.rglob("*.py") if p != package / "__init__.py"]
+    documents = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("notebooks/*"), *ROOT.glob("benchmarks/*.py")]
+    told = [p.read_text(encoding="utf-8") for p in documents if p.is_file() and p.name != "CHANGELOG.md"]
+    used = Counter(word for text in texts for word in re.findall(r"\w+", text))
+    named = {word for text in told for word in re.findall(r"\w+", text)}
+    for folder in (p.parent for p in package.glob("*/__init__.py")):
+        for name in public_names(folder):
+            # once where it is defined, once where the folder imports it, once in its __all__
+            assert used[name] > 3 or name in named, f"{folder.name}.{name} is public, and nobody uses it"

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .deformation import FreeFormDeformation
-    from .geometry import ConeBeamGeometry, MultisourceScanner, VolumeGrid
-    from .implant import Component, ImplantPointCloud
-    from .io import read_run
-    from .physics import PolyenergeticTransmission, line_integrals_from_intensity, tungsten_spectrum
+    from .geometry import ConeBeamGeometry, MultisourceScanner, VolumeGrid, circular_geometry
+    from .implant import Component, ImplantPointCloud, Screw, find_holes
+    from .io import read_components, read_geometry, read_mesh, read_projections, read_run
+    from .physics import PolyenergeticTransmission, line_integrals_from_intensity, material, tungsten_spectrum
     from .projector import PointCloudProjector, project_mesh, project_points
-    from .registration import RegistrationConfig, RegistrationData, RegistrationResult, Stage, register
+    from .reconstruction import fdk, reconstruct
+    from .registration import Implant, RegistrationConfig, RegistrationResult, Stage, register
+    from .scene import RegistrationData, Scene
     from .similarity import GradientCorrelationLoss, gradient_correlation
 
 __version__ = "0.1.0"
@@ -22,20 +24,32 @@ _HOMES = {
     "ConeBeamGeometry": "geometry",
     "FreeFormDeformation": "deformation",
     "GradientCorrelationLoss": "similarity",
+    "Implant": "registration",
     "ImplantPointCloud": "implant",
     "MultisourceScanner": "geometry",
     "PointCloudProjector": "projector",
     "PolyenergeticTransmission": "physics",
     "RegistrationConfig": "registration",
-    "RegistrationData": "registration",
+    "RegistrationData": "scene",
     "RegistrationResult": "registration",
+    "Scene": "scene",
+    "Screw": "implant",
     "Stage": "registration",
     "VolumeGrid": "geometry",
+    "circular_geometry": "geometry",
+    "fdk": "reconstruction",
+    "find_holes": "implant",
     "gradient_correlation": "similarity",
     "line_integrals_from_intensity": "physics",
+    "material": "physics",
     "project_mesh": "projector",
     "project_points": "projector",
+    "read_components": "io",
+    "read_geometry": "io",
+    "read_mesh": "io",
+    "read_projections": "io",
     "read_run": "io",
+    "reconstruct": "reconstruction",
     "register": "registration",
     "tungsten_spectrum": "physics",
 }
@@ -47,9 +61,9 @@ _FOLDERS = (
     "geometry",
     "implant",
     "io",
-    "physics",
     "kernels",
     "optimization",
+    "physics",
     "projector",
     "reconstruction",
     "registration",
@@ -65,6 +79,7 @@ __all__ = [
     "ConeBeamGeometry",
     "FreeFormDeformation",
     "GradientCorrelationLoss",
+    "Implant",
     "ImplantPointCloud",
     "MultisourceScanner",
     "PointCloudProjector",
@@ -72,14 +87,25 @@ __all__ = [
     "RegistrationConfig",
     "RegistrationData",
     "RegistrationResult",
+    "Scene",
+    "Screw",
     "Stage",
     "VolumeGrid",
     "__version__",
+    "circular_geometry",
+    "fdk",
+    "find_holes",
     "gradient_correlation",
     "line_integrals_from_intensity",
+    "material",
     "project_mesh",
     "project_points",
+    "read_components",
+    "read_geometry",
+    "read_mesh",
+    "read_projections",
     "read_run",
+    "reconstruct",
     "register",
     "tungsten_spectrum",
 ]

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 
 from torchkcreg.simulation import (
-    bead_meshes,
-    bone_fragments,
-    flared_plate,
     hole_positions,
     locking_plate,
     locking_screws,
@@ -49,38 +46,9 @@ def test_an_impossible_plate_is_refused(wrong):
         locking_plate(**wrong)
 
 
-def test_the_flared_plate_is_closed_wider_at_its_head_and_curved():
-    plate = flared_plate()
-    straight = flared_plate(bow_deg=0.0, twist_deg=0.0)
-    assert plate.is_watertight
-    assert plate.volume > 0
-    assert plate.extents[1] > straight.extents[1] + 3
-    widths = [np.ptp(straight.vertices[np.abs(straight.vertices[:, 2] - z) < 5, 0]) for z in (-70.0, 70.0)]
-    assert widths[1] / widths[0] == pytest.approx(1.8, rel=0.05)
-
-
 def test_screws_are_listed_and_meshed():
     screws = locking_screws([-63.0, 27.0])
     assert [fragment_at(screw.start[2]) for screw in screws] == ["distal", "proximal"]
     mesh = screws[1].mesh()
     assert mesh.is_watertight
     np.testing.assert_allclose(mesh.bounds[:, 1:], [[-34.0, 25.0], [2.3, 29.0]], atol=2e-3)
-
-
-def test_the_bone_is_two_hollow_closed_fragments_with_a_gap():
-    distal, proximal = bone_fragments(gap=4.0)
-    for fragment in (distal, proximal):
-        assert fragment.is_watertight
-        assert fragment.volume == pytest.approx(math.pi * (13**2 - 8**2) * 148, rel=2e-3)
-    assert distal.bounds[1, 2] == pytest.approx(-2.0)
-    assert proximal.bounds[0, 2] == pytest.approx(2.0)
-    with pytest.raises(ValueError, match="inner_radius"):
-        bone_fragments(inner_radius=20.0)
-    with pytest.raises(ValueError, match="gap"):
-        bone_fragments(gap=-1.0)
-
-
-def test_beads_are_round_and_where_they_should_be():
-    (bead,) = bead_meshes([[1.0, 2.0, 3.0]], radius=1.0)
-    assert bead.center_mass.tolist() == pytest.approx([1.0, 2.0, 3.0])
-    assert bead.volume == pytest.approx(4 / 3 * math.pi, rel=0.02)

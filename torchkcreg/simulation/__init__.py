@@ -7,9 +7,6 @@ from torchkcreg.simulation.cases import SimulatedCase, weight_bearing_case
 from torchkcreg.simulation.chords import chord_image, chord_lengths
 from torchkcreg.simulation.draws import Draw, draw_case
 from torchkcreg.simulation.hardware import (
-    bead_meshes,
-    bone_fragments,
-    flared_plate,
     hole_positions,
     locking_plate,
     locking_screws,
@@ -30,12 +27,9 @@ __all__ = [
     "SimulatedCase",
     "Sphere",
     "Tube",
-    "bead_meshes",
-    "bone_fragments",
     "chord_image",
     "chord_lengths",
     "draw_case",
-    "flared_plate",
     "hole_positions",
     "locking_plate",
     "locking_screws",

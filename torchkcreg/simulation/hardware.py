@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-import torch
 import trimesh
 
 from torchkcreg.implant import Screw
-from torchkcreg.simulation.loads import RodMotion
 from torchkcreg.simulation.outline import plate_outline
 
 
@@ -64,43 +62,6 @@ def hole_positions(*, length: float = 188.0, num_holes: int = 10, end_margin: fl
     return [(hole - (num_holes - 1) / 2) * pitch for hole in range(num_holes)]
 
 
-def flared_plate(
-    *,
-    length: float = 160.0,
-    width: float = 13.0,
-    thickness: float = 4.0,
-    num_holes: int = 8,
-    flare: float = 1.8,
-    bow_deg: float = 12.0,
-    twist_deg: float = 10.0,
-    max_edge: float = 2.5,
-) -> trimesh.Trimesh:
-    """Watertight mesh of an anatomical plate: flared towards +z, bowed about x, twisted about its long axis.
-
-    Args:
-        length: Length along its axis, mm.
-        width: Width of the shaft, mm.
-        thickness: Thickness, mm.
-        num_holes: Holes along the axis.
-        flare: Width of the head over that of the shaft.
-        bow_deg: Angle between the two ends about x, degrees.
-        twist_deg: Angle between the two ends about the axis, degrees.
-        max_edge: Spacing of the surface's grid lines, mm; triangles' long sides are up to 1.6 times as long.
-
-    Raises:
-        ValueError: As `locking_plate`.
-    """
-    plate = locking_plate(
-        length=length, width=width, thickness=thickness, num_holes=num_holes, hole_radius=2.25, max_edge=max_edge
-    )
-    vertices = torch.tensor(np.asarray(plate.vertices), dtype=torch.float64)
-    share = ((vertices[:, 2] / length - 0.05) / 0.35).clamp(0, 1)
-    vertices[:, 0] *= 1 + (flare - 1) * share**2 * (3 - 2 * share)
-    rate = torch.deg2rad(torch.tensor([bow_deg, 0.0, twist_deg], dtype=torch.float64)) / length
-    bent = RodMotion(lambda z: rate.expand(len(z), 3), (-length / 2, length / 2))
-    return trimesh.Trimesh(bent(vertices).numpy(), plate.faces, process=False)
-
-
 def locking_screws(
     positions: Sequence[float],
     *,
@@ -118,49 +79,6 @@ def locking_screws(
         Screw((0.0, head_y, float(z)), (0.0, tip_y, float(z)), radius, material, f"screw{number}")
         for number, z in enumerate(positions)
     ]
-
-
-def bone_fragments(
-    *,
-    outer_radius: float = 13.0,
-    inner_radius: float = 8.0,
-    offset_y: float = -17.0,
-    half_length: float = 150.0,
-    gap: float = 4.0,
-    sections: int = 64,
-) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Watertight meshes of the two fragments, distal and proximal, of a hollow bone along z with a gap at z = 0.
-
-    Args:
-        outer_radius: Outer radius, mm.
-        inner_radius: Radius of the marrow's channel, mm.
-        offset_y: Where the bone's axis lies, mm: behind the plate.
-        half_length: From z = 0 to either end, mm.
-        gap: Width of the gap, mm.
-        sections: Segments around.
-
-    Raises:
-        ValueError: If the radii or the gap leave nothing of the bone.
-    """
-    if not 0 < inner_radius < outer_radius:
-        raise ValueError(f"inner_radius must lie between 0 and {outer_radius}, got {inner_radius}")
-    if not 0 <= gap < 2 * half_length:
-        raise ValueError(f"gap must lie between 0 and {2 * half_length}, got {gap}")
-    height = half_length - gap / 2
-    fragments = []
-    for side in (-1, 1):
-        tube = trimesh.creation.annulus(r_min=inner_radius, r_max=outer_radius, height=height, sections=sections)
-        tube.apply_translation([0, offset_y, side * (gap + height) / 2])
-        fragments.append(tube)
-    return fragments[0], fragments[1]
-
-
-def bead_meshes(centers: Sequence[Sequence[float]], *, radius: float = 1.0) -> Iterator[trimesh.Trimesh]:
-    """Meshes of round beads about some centres, mm."""
-    for center in centers:
-        bead = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-        bead.apply_translation(np.asarray(center, dtype=float))
-        yield bead
 
 
 def _extruded(points: np.ndarray, triangles: np.ndarray, thickness: float, layers: int) -> trimesh.Trimesh:
