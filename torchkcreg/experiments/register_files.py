@@ -135,13 +135,13 @@ def write_run(
 
 
 class _Checkpoints(Callback):
-    """Writes a checkpoint after each stage, and every few seconds within one."""
+    """Writes a checkpoint after the steps that precede a stage's iterations, every few seconds then, and at its end."""
 
     def __init__(self, run: RunFolder) -> None:
         self.folder, self.last = run, time.perf_counter()
 
     def on_iteration(self, run: TrainerState, index: int, progress: Progress) -> None:
-        if time.perf_counter() - self.last > _CHECKPOINT_SECONDS:
+        if progress.iteration == 1 or time.perf_counter() - self.last > _CHECKPOINT_SECONDS:
             self._save(run)
 
     def on_stage_end(self, run: TrainerState, index: int, stage: Stage) -> None:
@@ -179,17 +179,16 @@ def _continue(run: RunFolder, trainer: Trainer, record: dict[str, Any]) -> None:
 
 
 def _metrics(result: RegistrationResult, scene: Scene, starts: Sequence[Tensor], seconds: float) -> dict[str, Any]:
-    each = []
+    motions = {}
     for implant, assembly, start in zip(result.implants, scene, starts, strict=True):
         points = assembly.implant.points.double()
-        each.append((implant.warp(points) - transform_points(start, points)).norm(dim=-1))
-    motion = torch.cat(each)
+        motions[implant.name] = (implant.warp(points) - transform_points(start, points)).norm(dim=-1)
     return {
         "status": result.status,
         "gc": result.gc.tolist(),
         "node_std_mm": result.diagnostics.get("node_std_mm"),
-        "mean_motion_mm": float(motion.mean()),
-        "largest_motion_mm": float(motion.max()),
+        **_motion(torch.cat(list(motions.values()))),
+        "implants": {name: _motion(motion) for name, motion in motions.items()},
         "intensity": result.intensity,
         "screws_found": [screw.to_dict() for screw in result.screws_found],
         "stages": result.stages,
@@ -197,3 +196,8 @@ def _metrics(result: RegistrationResult, scene: Scene, starts: Sequence[Tensor],
         "seconds": seconds,
         "warnings": result.warnings,
     }
+
+
+def _motion(distances: Tensor) -> dict[str, float]:
+    """How far nodes (N,) have moved from the start pose."""
+    return {"mean_motion_mm": float(distances.mean()), "largest_motion_mm": float(distances.max())}

@@ -65,13 +65,18 @@ class Stage(Config):
 
     def binning(self, pixel_mm: float) -> int:
         """How many of a detector's pixels are averaged along each side."""
-        return min(self.bin, max(1, int(_COARSEST_PIXEL_MM / pixel_mm)))
+        return binning(self.bin, pixel_mm)
 
     @model_validator(mode="after")
     def _slides_as_one(self) -> Stage:
         if "slide" in self.after and not self.level.is_rigid:
             raise ValueError(f"only a stage of one group can slide, this one has {self.groups} groups")
         return self
+
+
+def binning(asked: int, pixel_mm: float) -> int:
+    """How many pixels of a detector are averaged along each side: as many as asked, but none wider than an implant."""
+    return min(asked, max(1, int(_COARSEST_PIXEL_MM / pixel_mm)))
 
 
 def preset_stages(preset: PresetName) -> tuple[Stage, ...]:

@@ -12,7 +12,7 @@ from torchkcreg.geometry import transform_points, vector_from_rotation
 from torchkcreg.scene import RegistrationData, Scene
 from torchkcreg.similarity import GradientCorrelation, GradientDifference
 
-from .config import RegistrationConfig, Stage
+from .config import RegistrationConfig, Stage, binning
 from .prepared import data_with_background
 
 _PIXEL_MM = 1.5  # nothing finer is needed to see that a stage went astray
@@ -73,7 +73,7 @@ def misfit(scene: Scene, data: RegistrationData, config: RegistrationConfig, bin
 
     1 - GD with the background that goes with the scene, or 1 - GC where DRRs are path lengths; all pixels alike.
     """
-    bin = Stage(bin=bin).binning(data.geometry.pixel_spacing[1])
+    bin = binning(bin, data.geometry.pixel_spacing[1])
     make: type[GradientCorrelation] | type[GradientDifference] = GradientCorrelation
     if scene.intensity.has_background:
         data, make = data_with_background(scene, data, config, bin), GradientDifference
