@@ -10,7 +10,7 @@ import trimesh
 from small_scene import GRID_OF_SCREWS, drilled_plate, image, pose
 
 from torchkcreg.implant import Component, ImplantPointCloud, Screw, find_holes
-from torchkcreg.registration import RegistrationConfig, Stage, build_scene, find_screws, register
+from torchkcreg.registration import Implant, RegistrationConfig, Stage, build_scene, find_screws, register
 from torchkcreg.scene import RegistrationData, Scene, screw_path
 from torchkcreg.scene.screw_shapes import ScrewShapes
 
@@ -148,3 +148,24 @@ def test_the_metal_is_the_one_with_which_a_stage_ends_best(mesh: trimesh.Trimesh
     cloud = ImplantPointCloud.from_mesh(mesh, 0.5)
     result = register(cloud, data, CONFIG.model_copy(update={"stages": stages}), holes=find_holes(mesh))
     assert [found.material for found in result.screws_found] == [metal]
+
+
+def test_each_of_two_plates_finds_its_own_screws(mesh: trimesh.Trimesh) -> None:
+    cloud, holes = ImplantPointCloud.from_mesh(mesh, 0.5), find_holes(mesh)
+    beside = torch.eye(4, dtype=torch.float64)
+    beside[0, 3] = 20.0
+
+    def plates(screws: list[list[Screw]]) -> list[Implant]:
+        parts = [[Component.of(s, pitch=0.5) for s in own] for own in screws]
+        return [
+            Implant(cloud, parts[0], holes, name="medial"),
+            Implant(cloud, parts[1], holes, implant_to_world=beside, name="lateral"),
+        ]
+
+    lower = replace(TRUE, start=(0.0, 1.5, -15.0), end=(0.0, -16.0, -15.0))
+    data = image(build_scene(plates([[TRUE], [lower]]), CONFIG))
+    stages = (Stage(oversampling=1, before=("choose_screws",), estimate=("screws",), iterations=8),)
+    result = register(plates([[], []]), data, CONFIG.model_copy(update={"stages": stages}))
+    for implant, screw in zip(result.implants, (TRUE, lower), strict=True):
+        (found,) = implant.screws
+        assert np.allclose(found.end, screw.end, atol=0.5), implant.name

@@ -6,7 +6,7 @@ from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensi
 from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission, intensity_from_dict
 from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
 from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
-from torchkcreg.physics.scatter import scatter_shapes, scattered_signal
+from torchkcreg.physics.scatter import Veil, scatter_shapes, scattered_signal, veil_image
 from torchkcreg.physics.spectra import Spectrum, tungsten_spectrum
 from torchkcreg.physics.transmission import transmission
 
@@ -19,6 +19,7 @@ __all__ = [
     "Material",
     "PolyenergeticTransmission",
     "Spectrum",
+    "Veil",
     "calcium_in_water",
     "gaussian_blur",
     "gaussian_kernel",
@@ -31,4 +32,5 @@ __all__ = [
     "scattered_signal",
     "transmission",
     "tungsten_spectrum",
+    "veil_image",
 ]

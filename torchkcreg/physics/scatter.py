@@ -1,11 +1,21 @@
-"""Scatter as two broad images: one from what passes the object, one from what the object takes from the beam."""
+"""Broad scatter: two images from what is measured, with levels that a registration estimates, or a veil, a share of the
+primary, that is fitted to the air around an object and taken from projections."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from torchkcreg.physics.blur import gaussian_blur
+
+_AIR_WITHIN_MM = 20.0  # on the detector, of its left and right border
+_ITERATIONS = 40
+_SMOOTH_NODES = 6  # pixels a standard deviation that images are reduced to: a veil is smooth
 
 
 def scatter_shapes(transmission: Tensor, mask: Tensor, sigma_px: float) -> Tensor:
@@ -35,3 +45,77 @@ def scattered_signal(levels: Tensor, shapes: Tensor | None) -> Tensor:
     if shapes is None:
         return levels[:, 0, None, None, None]
     return torch.einsum("ks,svij->kvij", levels.to(shapes), shapes)
+
+
+@dataclass(frozen=True)
+class Veil:
+    """A broad, smooth share of the primary image that lies over it: scatter, or the detector's glare.
+
+    ``measured = primary + fraction * G primary`` with G a Gaussian blur; glare, which takes from the primary what it
+    gives, is the same up to the open beam's normalisation.
+
+    Attributes:
+        fraction: of the primary.
+        sigma_mm: standard deviation of the blur on the detector, mm.
+
+    Raises:
+        ValueError: a negative fraction, one of 1 or more, or a blur that is not positive.
+    """
+
+    fraction: float
+    sigma_mm: float = 40.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.fraction < 1:
+            raise ValueError(f"fraction of the veil must be between 0 and 1, got {self.fraction}")
+        if not (math.isfinite(self.sigma_mm) and self.sigma_mm > 0):
+            raise ValueError(f"sigma_mm of the veil must be positive, got {self.sigma_mm}")
+
+
+def veil_image(transmission: Tensor, veil: Veil, pixel_spacing: Sequence[float]) -> Tensor:
+    """What a veil adds to each pixel, (..., rows, cols), of measured transmissions I / I0.
+
+    Solves ``S = f G (I - S)`` by fixed-point iteration on images reduced to what the blur leaves of them.
+
+    Args:
+        transmission: measured intensity in units of the open beam, (..., rows, cols).
+        veil: its share and breadth.
+        pixel_spacing: (dv, du), mm.
+
+    >>> flat = torch.full((1, 32, 32), 1.2)
+    >>> round(float(veil_image(flat, Veil(0.2), (4.0, 4.0))[0, 16, 16]), 4)
+    0.2
+    """
+    if veil.fraction == 0:
+        return torch.zeros_like(transmission)
+    rows, cols = transmission.shape[-2:]
+    step = max(1, min(int(veil.sigma_mm / max(pixel_spacing) / _SMOOTH_NODES), rows // 4, cols // 4))
+    flat = transmission.reshape(-1, 1, rows, cols)
+    reduced = avg_pool2d(flat, step, ceil_mode=True, count_include_pad=False)
+    pitch = step * math.sqrt(pixel_spacing[0] * pixel_spacing[1])
+    smooth = fixed_point_veil(reduced, veil.fraction, veil.sigma_mm / pitch, pitch)
+    if step == 1:
+        return smooth.reshape(transmission.shape)
+    covered = (reduced.shape[-2] * step, reduced.shape[-1] * step)
+    fine = interpolate(smooth, size=covered, mode="bilinear", align_corners=False)
+    return fine[..., :rows, :cols].reshape(transmission.shape)
+
+
+def fixed_point_veil(measured: Tensor, fraction: float, sigma_px: float, pitch: float) -> Tensor:
+    """The veil (n, 1, rows, cols) of images with pixels of a pitch in mm.
+
+    Above and below, the limb goes on; to the left and right of the detector there is air, if not at once: the primary
+    rises to 1 there over `_AIR_WITHIN_MM`.
+    """
+    veil = measured * (fraction / (1 + fraction))
+    extra = max(1, min(math.ceil(2.5 * sigma_px), 4 * measured.shape[-1]))
+    steps = torch.arange(1, extra + 1, dtype=measured.dtype, device=measured.device)
+    rise = 0.5 - 0.5 * torch.cos(math.pi * (steps * pitch / _AIR_WITHIN_MM).clamp_max(1))
+    for _ in range(_ITERATIONS):
+        primary = measured - veil
+        left, right = primary[..., :1], primary[..., -1:]
+        sides = [left + (1 - left) * rise.flip(0), primary, right + (1 - right) * rise]
+        last, veil = veil, fraction * gaussian_blur(torch.cat(sides, -1), sigma_px)[..., extra:-extra]
+        if float((veil - last).abs().max()) < 1e-6:
+            break
+    return veil

@@ -4,9 +4,10 @@
 into line integrals and weights, with known components (KC-Rec), scatter and beam hardening accounted for.
 """
 
+from torchkcreg.physics import Veil, veil_image
 from torchkcreg.scene import KnownComponent
 
-from .corrections import Veil, fit_veil, floored_line_integrals, refined_scatter, veil_image
+from .corrections import fit_veil, floored_line_integrals, refined_scatter
 from .ct_numbers import hounsfield
 from .dead_pixels import filled
 from .fdk import FDKConfig, fdk

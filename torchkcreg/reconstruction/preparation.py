@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
+from torchkcreg.physics import Veil, veil_image
 from torchkcreg.scene import KnownComponent
 
-from .corrections import Veil, floored_line_integrals, veil_image
+from .corrections import floored_line_integrals
 from .dead_pixels import filled_transmission
 from .known_component import component_shares, without_components
 from .spectral import BeamModel

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
-from torchkcreg.physics import Beam
+from torchkcreg.physics import Beam, Veil, veil_image
 from torchkcreg.scene import KnownComponent
 
-from .corrections import Veil, refined_scatter, veil_image
+from .corrections import refined_scatter
 from .known_component import component_shares, unknown_share
 from .preparation import PreparedData, prepare
 from .pwls import PWLS

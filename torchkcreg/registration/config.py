@@ -12,6 +12,8 @@ from torchkcreg.deformation import BendingPrior, Level
 SimilarityName = Literal["gradient-correlation", "gradient-difference"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
 
+PHYSICS = ("scatter", "removed", "blur", "hardness")  # what a polyenergetic intensity model offers
+
 _COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
 
 
@@ -102,8 +104,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         before=("find_screws",),
         after=("slide",),
     )
-    physics = ("scatter", "removed", "blur", "hardness")
-    parts, every = ("screws", "tilts"), ("screws", "tilts", *physics)
+    parts, every = ("screws", "tilts"), ("screws", "tilts", *PHYSICS)
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
     fine = {"estimate": every, "before": ("background", "reweight"), **seen}
     hardness = ("scatter", "removed", "hardness")  # coarse pixels do not tell blur
@@ -120,7 +121,7 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         levels = [
             Stage(bin=4, pitch_factor=2, step_mm=0.5, tolerance=0.02, **evolve),
             Stage(groups=2, bin=4, pitch_factor=2, step_mm=0.3, tolerance=0.01, **evolve),
-            Stage(groups=2, bin=2, pitch_factor=4, step_mm=0.1, tolerance=0.01, estimate=physics, **evolve),
+            Stage(groups=2, bin=2, pitch_factor=4, step_mm=0.1, tolerance=0.01, estimate=PHYSICS, **evolve),
             *(
                 Stage(
                     groups=groups,

@@ -45,6 +45,7 @@ def choose(run: StageRun) -> None:
             trials.append((screws, float(trial.objective.losses(trial.begin().best()[None])[0]), trial))
         best = of_best_metal([(screws, loss) for screws, loss, _ in trials])
         assembly.place(best)
+        run.renew()
         if len(_with_holes(run)) == 1:  # with others to come it must run again
             chosen = next(trial for screws, _, trial in trials if screws == best)
             run.data, run.objective, run.remaining = chosen.data, chosen.objective, []

@@ -11,7 +11,7 @@ from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import OPTIMIZERS, Progress
 from torchkcreg.scene import RegistrationData, Scene
 
-from .config import RegistrationConfig, Stage
+from .config import PHYSICS, RegistrationConfig, Stage
 from .finish import finished
 from .guard import Guard
 from .prepared import with_scatter_shapes
@@ -93,8 +93,9 @@ class Trainer:
                     raise ValueError(f"there is no step {name!r}: steps are {', '.join(sorted(self.steps))}")
             if stage.optimizer not in OPTIMIZERS and self.terms.optimizer is None:
                 raise ValueError(f"optimizer must be one of {', '.join(OPTIMIZERS)}, got {stage.optimizer!r}")
-            known = {"screws", "tilts", *self.scene.intensity.free}
-            if self.scene.intensity.free and (unknown := sorted(set(stage.estimate) - known)):
+            free = self.scene.intensity.free
+            known = {"screws", "tilts", *(free or PHYSICS)}  # plain path lengths leave physics out
+            if unknown := sorted(set(stage.estimate) - known):
                 raise ValueError(f"{unknown[0]!r} cannot be estimated: {', '.join(sorted(known))} can")
 
     def check(self) -> None:

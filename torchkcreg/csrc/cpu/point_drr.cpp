@@ -149,9 +149,10 @@ Gradients<scalar_t> gradient_pointers(const Tensor& points, const Tensor& volume
           matrices.numel() ? matrices.mutable_data_ptr<scalar_t>() : nullptr};
 }
 
-std::tuple<Tensor, Tensor, Tensor> point_drr_backward(const Tensor& grad_, const Tensor& points_, const Tensor& volumes_,
-                                                      const Tensor& matrices_, const Tensor& table_, int64_t block_size,
-                                                      bool need_volumes, bool need_matrices) {
+std::tuple<Tensor, Tensor, Tensor> point_drr_backward(const Tensor& grad_, const Tensor& points_,
+                                                      const Tensor& volumes_, const Tensor& matrices_,
+                                                      const Tensor& table_, int64_t block_size, bool need_volumes,
+                                                      bool need_matrices) {
   STD_TORCH_CHECK(grad_.dim() == 4, "grad must have shape (B, V, rows, cols)");
   const Problem p = check(points_, volumes_, matrices_, table_, block_size, grad_.size(2), grad_.size(3));
   STD_TORCH_CHECK(grad_.size(0) == p.candidates && grad_.size(1) == p.views && grad_.is_cpu() &&

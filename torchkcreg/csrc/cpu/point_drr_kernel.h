@@ -80,9 +80,9 @@ TORCHKCREG_INLINE void spread_nodes(ChunkView<scalar_t>& chunk, const TableShape
 
 template <typename scalar_t>
 struct ChunkGradients {
-  scalar_t* points;  // (count, 3), added to
+  scalar_t* points;   // (count, 3), added to
   scalar_t* volumes;  // (count,), added to; may be null
-  double* matrix;    // (3, 4), added to; may be null
+  double* matrix;     // (3, 4), added to; may be null
 };
 
 // What the image's gradient says of a batch of nodes: of (U, V, W) = P (x, y, z, 1), and of the volume.
