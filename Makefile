@@ -48,7 +48,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(PYTEST) -m "not slow"
 
-# All tests, those against RTK among them; one that is skipped is a failure, unless it asks for data from elsewhere.
+# All tests, those against RTK among them; one that is skipped is a failure, unless it asks for data or a device from elsewhere.
 test-full: $(STAMP)
 	$(PIP) --no-build-isolation --editable ".[$(EXTRAS),parity]"
 	$(PYTEST) --no-skips
