@@ -95,6 +95,15 @@ def test_the_page_on_extending_runs_from_start_to_end(capsys):
     assert "RegistrationResult(" in out and "('auto', 'cpp', 'torch') True False" in out
 
 
+def test_the_page_on_elastic_bodies_runs(capsys):
+    page = (ROOT / "docs" / "mechanics.md").read_text(encoding="utf-8")
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(block, "mechanics.md", "exec"), {})
+    bent, stress = (float(re.search(r"tensor\(\[+([-.\d]+)", line)[1]) for line in capsys.readouterr().out.splitlines())
+    assert bent == pytest.approx(100 * 110**3 / (48 * 193_000 * 10 * 4**3 / 12), rel=0.05)
+    assert stress == pytest.approx(50 * 45 * 2 / (10 * 4**3 / 12), rel=0.05)
+
+
 def public_names(folder: Path) -> list[str]:
     """The names in the `__all__` of a folder."""
     for node in ast.parse((folder / "__init__.py").read_text(encoding="utf-8")).body:

@@ -62,6 +62,7 @@ _FOLDERS = (
     "implant",
     "io",
     "kernels",
+    "mechanics",
     "optimization",
     "physics",
     "projector",

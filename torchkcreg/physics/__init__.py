@@ -3,6 +3,7 @@
 from torchkcreg.physics.beam import Beam
 from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
 from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
+from torchkcreg.physics.elastic_constants import ElasticConstants, elastic_constants
 from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission, intensity_from_dict
 from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
 from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
@@ -13,6 +14,7 @@ from torchkcreg.physics.transmission import transmission
 __all__ = [
     "COUNT_FLOOR",
     "Beam",
+    "ElasticConstants",
     "FreeParameter",
     "IdentityIntensity",
     "IntensityModel",
@@ -21,6 +23,7 @@ __all__ = [
     "Spectrum",
     "Veil",
     "calcium_in_water",
+    "elastic_constants",
     "gaussian_blur",
     "gaussian_kernel",
     "intensity_from_dict",
