@@ -235,7 +235,7 @@ def bending(content):
         (lambda c: c.update(format="other"), "must be a 'torchkcreg deformation', got 'other'"),
         (lambda c: c.update(format_version=99), "format_version must be at most 2, got 99"),
         (lambda c: bending(c).pop("grid"), "'grid' of a deformation is missing"),
-        (lambda c: bending(c).update(model="jelly"), "model must be one of ffd, rigid, got 'jelly'"),
+        (lambda c: bending(c).update(model="jelly"), "model must be one of fe, ffd, rigid, got 'jelly'"),
         (lambda c: bending(c)["grid"].pop("spacing_mm"), "'spacing_mm' of the grid is missing"),
         (lambda c: bending(c)["control_points_mm"].pop(), "control_points_mm must be 5 x 5 x 7 x 3 numbers"),
         (lambda c: c["implants"][0].update(implant_to_world=[[1.0]]), "implant_to_world must be 4 x 4 numbers"),

@@ -35,9 +35,9 @@ class Hinge(LinearDeformation):
 
     model = "hinge"
 
-    def __init__(self, cloud, config) -> None:
+    def __init__(self, implant, config) -> None:
         super().__init__(2)
-        self.height = float(cloud.points[:, 2].quantile(2 / 3))
+        self.height = float(implant.cloud.points[:, 2].quantile(2 / 3))
 
     def shapes(self, points):
         x, y, z = points.unbind(-1)
@@ -66,7 +66,7 @@ def test_a_deformation_of_ones_own_is_registered() -> None:
 def test_one_without_any_bending_only_moves() -> None:
     truth = pose(2, 2)
     result = register(
-        plate(), image(scene(BENDING, truth)), BENDING, deformation=lambda cloud, config: RigidDeformation()
+        plate(), image(scene(BENDING, truth)), BENDING, deformation=lambda implant, config: RigidDeformation()
     )
     points = plate().points.double()
     torch.testing.assert_close(result.warp(points), transform_points(truth, points), atol=0.02, rtol=0)

@@ -28,6 +28,7 @@ def add_register(commands) -> None:
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, where the file does not say it")
     command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
     command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")
+    command.add_argument("--deformation", help="how it bends: modes (elastic modes, default), ffd (the paper's) or fe")
     command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
     command.add_argument("--seed", type=int, help="seed of the random numbers")
     command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
@@ -64,7 +65,7 @@ def _register(options: argparse.Namespace) -> int:
     each = {name: _only(getattr(options, name)) for name in ("implant", "components", "init")}
     materials = options.material if options.material and len(options.material) > 1 else None
     files = RegistrationFiles(**each, materials=materials, **{name: getattr(options, name) for name in named})
-    names = ("preset", "pitch_mm", "seed", "backend", "device")
+    names = ("preset", "deformation", "pitch_mm", "seed", "backend", "device")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     overrides |= {"material": options.material[0]} if options.material else {}
     how = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}

@@ -5,6 +5,7 @@ points are in the grid's axes, points and fields in the implant's frame."""
 from torchkcreg.deformation.clustering import cluster_control_points, control_point_volumes
 from torchkcreg.deformation.elasticity import Elasticity
 from torchkcreg.deformation.ffd import FreeFormDeformation
+from torchkcreg.deformation.finite_elements import FiniteElementDeformation, FiniteElementMotion
 from torchkcreg.deformation.group_motion import GroupMotion
 from torchkcreg.deformation.groups import (
     control_points_from_groups,
@@ -27,6 +28,8 @@ __all__ = [
     "BendingPrior",
     "Deformation",
     "Elasticity",
+    "FiniteElementDeformation",
+    "FiniteElementMotion",
     "FreeFormDeformation",
     "GroupMotion",
     "Level",

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from torchkcreg.deformation.ffd import FreeFormDeformation
+from torchkcreg.deformation.finite_elements import FiniteElementDeformation
 from torchkcreg.deformation.linear import RigidDeformation
 from torchkcreg.deformation.model import Deformation
+from torchkcreg.mechanics import Superelement
 from torchkcreg.plain import finite_array, require_keys
 from torchkcreg.splines import ControlPointGrid
 
@@ -35,4 +37,11 @@ def _free_form(content: dict[str, Any]) -> FreeFormDeformation:
     return FreeFormDeformation(ControlPointGrid((nx, ny, nz), (sx, sy, sz), frame), points.double(), labels)
 
 
-_READERS = {"ffd": _free_form, "rigid": lambda content: RigidDeformation()}
+def _finite_elements(content: dict[str, Any]) -> FiniteElementDeformation:
+    require_keys(content, ("superelement", "amounts", "load_weight"), " of a deformation")
+    superelement = Superelement.from_dict(content["superelement"])
+    amounts = finite_array(content["amounts"], (superelement.num_amounts,), "amounts")
+    return FiniteElementDeformation(superelement, amounts, load_weight=float(content["load_weight"]))
+
+
+_READERS = {"fe": _finite_elements, "ffd": _free_form, "rigid": lambda content: RigidDeformation()}

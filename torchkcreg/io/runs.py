@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchkcreg.deformation import SplineField
 from torchkcreg.geometry import transform_points
+from torchkcreg.io.arrays import with_arrays, without_arrays, write_arrays
 from torchkcreg.io.config import write_config
 from torchkcreg.io.figures import write_figure
 from torchkcreg.io.files import TEMPORARY_PREFIX, atomic_path, read_json, write_json
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
 
 CONFIG, VERSIONS, HISTORY, METRICS = "config.yaml", "versions.json", "history.json", "metrics.json"
 DEFORMATION, FIELD, TRANSFORM, CLOUD = "deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply"
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT, ARRAYS = "checkpoint.pt", "arrays.npz"
 SEEDS = "seeds"
 FIGURES = ("overlay.png", "displacement.png", "history.png")
-RUN_FILES = (DEFORMATION, CONFIG, VERSIONS, HISTORY, METRICS, FIELD, TRANSFORM, CLOUD, CHECKPOINT, *FIGURES)
+RUN_FILES = (DEFORMATION, CONFIG, VERSIONS, HISTORY, METRICS, FIELD, TRANSFORM, CLOUD, CHECKPOINT, ARRAYS, *FIGURES)
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
@@ -45,6 +46,7 @@ class RunFolder:
     | `history.json` | a record an iteration |
     | `metrics.json` | what was measured |
     | `deformation.json` | all parameters of the result; written last, so where it is the run is complete |
+    | `arrays.npz` | what of it is too long for JSON: of finite elements, how the implant responds to loads |
     | `dvf.mha` | displacement field, see `displacement_field` |
     | `bspline.tfm` | ITK transform, see `itk_transform` |
     | `implant_deformed.ply` | the deformed point cloud with the displacement of each node |
@@ -153,8 +155,10 @@ class RunFolder:
         Raises:
             ValueError: a parameter is not finite.
         """
-        content = plain(result.to_dict())  # refuses what cannot be written before anything is
-        (self.path / DEFORMATION).unlink(missing_ok=True)
+        content, arrays = without_arrays(result.to_dict())
+        content = plain(content)  # refuses what cannot be written before anything is
+        for name in (DEFORMATION, ARRAYS):
+            (self.path / name).unlink(missing_ok=True)
         self.write_history(result.history)
         starts = initial_to_world or [torch.eye(4, dtype=torch.float64)] * len(result.implants)
         for number, (implant, nodes, start) in enumerate(zip(result.implants, points, starts, strict=True)):
@@ -166,6 +170,8 @@ class RunFolder:
             if isinstance(deformation, SplineField):
                 write_itk_transform(self.path / f"{prefix}{TRANSFORM}", pose, deformation)
             write_point_cloud_ply(self.path / f"{prefix}{CLOUD}", moved, displacement)
+        if arrays:
+            write_arrays(self.path / ARRAYS, arrays)
         write_json(self.path / DEFORMATION, content, indent=None)
 
     def read_result(self) -> RegistrationResult:
@@ -175,7 +181,7 @@ class RunFolder:
             state = "is not finished" if (self.path / CONFIG).is_file() else "is no run"
             raise FileNotFoundError(f"run folder {self.path} {state}: it has no {DEFORMATION}")
         history = read_json(self.path / HISTORY, "history") if (self.path / HISTORY).is_file() else []
-        content = read_json(path, "deformation")
+        content = with_arrays(read_json(path, "deformation"), self.path / ARRAYS)
         try:
             return RegistrationResult.from_dict(content, history=history)
         except ValueError as error:

@@ -1,7 +1,22 @@
-"""An implant as an elastic body: stiffness from its own nodes, without a mesh; displacements and stresses."""
+"""An implant as an elastic body: stiffness from its own nodes, without a mesh; displacements, loads and stresses."""
 
-from torchkcreg.mechanics.body import ElasticBody, von_mises
+from torchkcreg.mechanics.body import ElasticBody
 from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for
+from torchkcreg.mechanics.holds import Hold, holds_of
+from torchkcreg.mechanics.sections import Sections
 from torchkcreg.mechanics.stiffness import stiffness_matrix
+from torchkcreg.mechanics.stress import von_mises
+from torchkcreg.mechanics.superelement import LoadPrior, Superelement
 
-__all__ = ["ElasticBody", "Hexahedra", "edge_for", "stiffness_matrix", "von_mises"]
+__all__ = [
+    "ElasticBody",
+    "Hexahedra",
+    "Hold",
+    "LoadPrior",
+    "Sections",
+    "Superelement",
+    "edge_for",
+    "holds_of",
+    "stiffness_matrix",
+    "von_mises",
+]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,8 +12,9 @@ from torch import Tensor
 
 from torchkcreg.geometry import invert_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for
+from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for, interpolated
 from torchkcreg.mechanics.stiffness import stiffness_matrix
+from torchkcreg.mechanics.stress import stresses, volumes_in_cubes
 from torchkcreg.physics import ElasticConstants
 
 _INERTIA_PITCH_MM = 1.0  # what is left over of loads is carried evenly; any even distribution will do
@@ -34,6 +34,7 @@ class ElasticBody:
 
     Attributes:
         hexahedra: The cubes; displacements are given at their nodes, (..., N, 3), in the implant's axes, mm.
+        filled: How much of the implant is in each cube, shape (E,), mm^3.
         stiffness: Sparse matrix (3 N, 3 N), N/mm, in the lattice's axes.
     """
 
@@ -42,9 +43,7 @@ class ElasticBody:
         self.hexahedra = Hexahedra.around(cloud, edge_for(cloud) if edge is None else edge)
         self.stiffness = stiffness_matrix(self.hexahedra, cloud, constants)
         self._turn = self.hexahedra.frame[:3, :3]
-        cube, _ = self.hexahedra.locate(cloud.points)
-        volumes = cloud.volumes.double()
-        self._filled = volumes.new_zeros(len(self.hexahedra.cells)).index_add_(0, cube, volumes)
+        self.filled = volumes_in_cubes(self.hexahedra, cloud)
         positions = self.hexahedra.positions
         middle = positions.mean(0)
         self._rigid = _rigid_fields(positions - middle)  # (6, N, 3)
@@ -90,53 +89,11 @@ class ElasticBody:
 
     def displacement(self, points: Tensor, nodal: Tensor) -> Tensor:
         """Displacements (L, P, 3) of points (P, 3) of the implant's frame, of those (L, N, 3) of the nodes, mm."""
-        cube, inside = self.hexahedra.locate(points)
-        values, _ = self.hexahedra.shape_functions(inside)
-        return torch.einsum("pa,lpai->lpi", values, nodal[:, self.hexahedra.nodes[cube]])
+        return interpolated(self.hexahedra, nodal, *self.hexahedra.locate(points))
 
     def stress(self, points: Tensor, nodal: Tensor) -> Tensor:
-        """Stresses (L, P, 3, 3) at points of the implant, N/mm^2, in its axes.
-
-        Taken where quadratic shape functions know them best, at the 2 x 2 x 2 places of Barlow (1976) in each cube,
-        extrapolated to the cubes' corners, averaged there over the metal, and linear in between.
-        """
-        cells = self.hexahedra
-        lowest = [0, 2, 6, 8, 18, 20, 24, 26]
-        ends = torch.tensor([-1.0, 1.0], dtype=torch.float64, device=nodal.device)
-        corners = torch.cartesian_prod(ends, ends, ends)
-        _, slopes = cells.shape_functions(corners / math.sqrt(3))
-        taken = self._stresses(torch.einsum("gaj,leai->legij", slopes, nodal[:, cells.nodes]))
-        outward = torch.einsum("cg,legij->lecij", _trilinear(corners * math.sqrt(3)), taken)
-        nodes = cells.nodes[:, lowest]
-        share = self._filled[:, None].expand(nodes.shape)
-        sums = outward.new_zeros(len(nodal), cells.num_nodes, 3, 3)
-        sums.index_add_(1, nodes.flatten(), (outward * share[..., None, None]).flatten(1, 2))
-        whole = share.new_zeros(cells.num_nodes).index_add_(0, nodes.flatten(), share.flatten())
-        cube, inside = cells.locate(points)
-        there = sums[:, nodes[cube]] / whole[nodes[cube]][..., None, None]
-        return torch.einsum("pc,lpcij->lpij", _trilinear(inside.clamp(-1, 1)), there)
-
-    def _stresses(self, slopes: Tensor) -> Tensor:
-        """Of displacement gradients (..., 3, 3), d u_i / d x_j: i along the implant's axes, j along the lattice's."""
-        slopes = slopes @ self._turn.mT
-        strain = 0.5 * (slopes + slopes.mT)
-        lame, shear = self.constants.lame
-        trace = strain.diagonal(dim1=-2, dim2=-1).sum(-1)
-        same = torch.eye(3, dtype=strain.dtype, device=strain.device)
-        return lame * trace[..., None, None] * same + 2 * shear * strain
-
-
-def _trilinear(inside: Tensor) -> Tensor:
-    """Weights (P, 8) of a cube's corners at places (P, 3) in it, from -1 to 1."""
-    ends = torch.stack([1 - inside, 1 + inside], dim=-1) / 2
-    return torch.einsum("pi,pj,pk->pijk", *ends.unbind(1)).flatten(1)
-
-
-def von_mises(stress: Tensor) -> Tensor:
-    """Equivalent stress (...) of stresses (..., 3, 3): metal yields where it reaches the yield stress."""
-    trace = stress.diagonal(dim1=-2, dim2=-1).sum(-1)
-    deviator = stress - trace[..., None, None] / 3 * torch.eye(3, dtype=stress.dtype, device=stress.device)
-    return (1.5 * deviator.square().sum((-2, -1))).sqrt()
+        """Stresses (L, P, 3, 3) at points of the implant, N/mm^2, in its axes; see `stresses`."""
+        return stresses(self.hexahedra, self.filled, self.constants, points, nodal)
 
 
 def _rigid_fields(positions: Tensor) -> Tensor:

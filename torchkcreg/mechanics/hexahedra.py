@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from torchkcreg.geometry import invert_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud
@@ -54,10 +55,15 @@ class Hexahedra:
         index = torch.minimum(index.clamp_min(0), torch.tensor(shape, device=index.device) - 1)
         filled[tuple(index.unbind(-1))] = True
         cells = filled.permute(2, 1, 0).nonzero().flip(-1)  # along the longest axis first
-        number_of = torch.full(shape, -1, dtype=torch.long, device=center.device)
-        number_of[tuple(cells.unbind(-1))] = torch.arange(len(cells), device=center.device)
-        nodes, positions = _numbered(cells, shape, edge)
-        return cls(frame, edge, cells, nodes, positions, number_of)
+        return cls.of_cells(frame, edge, cells)
+
+    @classmethod
+    def of_cells(cls, frame: Tensor, edge: float, cells: Tensor) -> Hexahedra:
+        """Of the lattice indices of cubes, which begin at zero along each axis."""
+        shape = [int(n) for n in (cells.amax(0) + 1).tolist()]
+        number_of = torch.full(shape, -1, dtype=torch.long, device=cells.device)
+        number_of[tuple(cells.unbind(-1))] = torch.arange(len(cells), device=cells.device)
+        return cls(frame, edge, cells, *_numbered(cells, shape, edge), number_of)
 
     @property
     def num_nodes(self) -> int:
@@ -75,7 +81,7 @@ class Hexahedra:
         cube = self.number_of[tuple(index.unbind(-1))]
         astray = (cube < 0).nonzero().flatten()
         if len(astray):
-            middles = (self.cells + 0.5) * self.edge
+            middles = (self.cells.double() + 0.5) * self.edge
             for some in astray.split(4096):
                 cube[some] = torch.cdist(local[some], middles).argmin(-1)
         inside = 2 * (local / self.edge - self.cells[cube]) - 1
@@ -90,6 +96,14 @@ class Hexahedra:
             torch.einsum("pi,pj,pk->pijk", *parts).flatten(1) for parts in ((dx, y, z), (x, dy, z), (x, y, dz))
         ]
         return together, torch.stack(gradients, dim=-1)
+
+
+def interpolated(hexahedra: Hexahedra, nodal: Tensor, cube: Tensor, inside: Tensor) -> Tensor:
+    """Values (L, P, 3) at places (P, 3) in cubes (P,) of values (L, N, 3) at the nodes."""
+    values, _ = hexahedra.shape_functions(inside)
+    table = nodal.transpose(0, 1).flatten(1)
+    found = embedding_bag(hexahedra.nodes[cube], table, per_sample_weights=values.to(table), mode="sum")
+    return found.unflatten(1, (len(nodal), 3)).transpose(0, 1)
 
 
 def _quadratics(inside: Tensor) -> Tensor:

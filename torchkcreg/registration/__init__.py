@@ -6,8 +6,9 @@ from torchkcreg.scene import RegistrationData, Scene, with_background
 
 from .callbacks import ProgressBar, TrainerState
 from .config import RegistrationConfig, Stage, preset_stages
+from .models import Implant
 from .objective import Objective
-from .register import Implant, build_scene, register
+from .register import build_scene, register
 from .registered_implant import RegisteredImplant
 from .result import RegistrationResult
 from .screws import find_screws

@@ -10,6 +10,7 @@ from torchkcreg.config import Config
 from torchkcreg.deformation import BendingPrior, Level
 
 SimilarityName = Literal["gradient-correlation", "gradient-difference"]
+DeformationName = Literal["ffd", "modes", "fe"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
 
 PHYSICS = ("scatter", "removed", "blur", "hardness")  # what a polyenergetic intensity model offers
@@ -81,7 +82,7 @@ def binning(asked: int, pixel_mm: float) -> int:
     return min(asked, max(1, int(_COARSEST_PIXEL_MM / pixel_mm)))
 
 
-def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
+def preset_stages(preset: PresetName, deformation: DeformationName = "modes") -> tuple[Stage, ...]:
     """Stages of a named schedule.
 
     All begin with a rigid CMA-ES on coarse pixels, which forgives a start that is off by several mm.
@@ -89,7 +90,10 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
     * "gauss-newton": then Gauss-Newton from one group to two, and on along elastic modes.
     * "paper": then CMA-ES with population 40, at most 400 iterations a stage, from 2 to 10 groups (Cao et al. 2020).
     * "adam": the groups and images of "gauss-newton", with Adam.
+
+    Where the deformation is "ffd", groups move freely in all stages.
     """
+    finest = {"groups": 10} if deformation == "ffd" else {"groups": 20, "modes": 40}
     start = Stage(
         bin=16,
         pitch_factor=8,
@@ -113,8 +117,8 @@ def preset_stages(preset: PresetName) -> tuple[Stage, ...]:
         Stage(bin=4, before=("find_screws", "background"), estimate=(*parts, *hardness), **seen),
         Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen),
         Stage(groups=2, bin=2, **fine),
-        Stage(groups=20, modes=40, bin=2, **fine),
-        Stage(groups=20, modes=40, bin=1, **fine),
+        Stage(**finest, bin=2, **fine),
+        Stage(**finest, bin=1, **fine),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
@@ -149,6 +153,8 @@ class RegistrationConfig(Config):
         preset: Named schedule, used when ``stages`` is empty.
         stages: The schedule itself, see :class:`Stage`.
         material: Name of the implant's material; None keeps plain path lengths (the paper's DRR).
+        deformation: How the implant bends: "ffd" by groups of control points (the paper's model), "modes" by groups
+            along the implant's softest elastic modes, "fe" as an elastic body loaded at its holes.
         pitch_mm: Lattice pitch of the implant's point cloud, mm.
         grid_shape: Control points along the principal axes, shortest axis first; grown where the implant needs more.
         grid_spacing_mm: Spacing of the control points, mm.
@@ -157,6 +163,9 @@ class RegistrationConfig(Config):
             over Young's modulus. That is half a squared strain: 30 charges 1e-5 of GC for strains of 1e-3, where steel
             yields, and 1e-3 for strains of 1e-2.
         load_weight: Loss for a load of 1 kN along an elastic mode, in stages of modes; it grows with the load's square.
+        hold_force_n: Force along each axis that is expected at a hole, standard deviation, N; of finite elements.
+        hold_moment_nmm: Moment about each axis there, N mm.
+        hold_weight: Loss for a load that is a standard deviation; it grows with the load's square.
         prior_weight: Loss for a parameter of the intensity model that is a standard deviation off where it most likely
             is; it grows with the square.
         youngs_modulus_gpa: Young's modulus of the implant, GPa. The default is that of steel; only its square times
@@ -177,12 +186,16 @@ class RegistrationConfig(Config):
     preset: PresetName = "gauss-newton"
     stages: tuple[Stage, ...] = ()
     material: str | None = None
+    deformation: DeformationName = "modes"
     pitch_mm: float = Field(0.25, gt=0)
     grid_shape: tuple[int, int, int] = (6, 6, 10)
     grid_spacing_mm: tuple[float, float, float] = (8.75, 8.75, 17.5)
     beta: float = Field(1e-4, ge=0)
     stiffness: float = Field(30.0, ge=0)
     load_weight: float = Field(3e-9, ge=0)
+    hold_force_n: float = Field(300.0, gt=0)
+    hold_moment_nmm: float = Field(5000.0, gt=0)
+    hold_weight: float = Field(1e-5, ge=0)
     prior_weight: float = Field(5e-4, ge=0)
     youngs_modulus_gpa: float = Field(200.0, gt=0)
     scatter: float = Field(0.08, ge=0, lt=1)
@@ -212,4 +225,4 @@ class RegistrationConfig(Config):
 
     def schedule(self) -> tuple[Stage, ...]:
         """The stages that will run."""
-        return self.stages or preset_stages(self.preset)
+        return self.stages or preset_stages(self.preset, self.deformation)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from torchkcreg.callbacks import Callback
-from torchkcreg.deformation import Deformation, FreeFormDeformation
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
 from torchkcreg.optimization import OptimizerFactory
 from torchkcreg.physics import (
@@ -21,43 +19,13 @@ from torchkcreg.physics import (
     tungsten_spectrum,
 )
 from torchkcreg.scene import Assembly, RegistrationData, Scene
-from torchkcreg.splines import default_grid
 
 from .config import RegistrationConfig
+from .models import DeformationFactory, Implant, deformation_of
 from .objective import Penalty, SimilarityFactory
 from .result import RegistrationResult
 from .stage_run import Step, Terms
 from .trainer import Trainer
-
-DeformationFactory = Callable[[ImplantPointCloud, RegistrationConfig], Deformation]
-
-
-@dataclass(frozen=True)
-class Implant:
-    """An implant as a registration is told of it.
-
-    Attributes:
-        cloud: Undeformed implant in its own frame.
-        components: Screws and the like, in the implant's frame; each follows the implant near its head.
-        holes: Its holes, see :func:`torchkcreg.implant.find_holes`: where no components are given, screws are looked
-            for in them.
-        implant_to_world: Approximate pose (4, 4); the identity when None.
-        material: Name of its material; that of the options when None.
-        name: How results refer to it.
-    """
-
-    cloud: ImplantPointCloud
-    components: Sequence[Component] = ()
-    holes: Sequence[Hole] = ()
-    implant_to_world: Tensor | None = None
-    material: str | None = None
-    name: str = "implant"
-
-
-def free_form(cloud: ImplantPointCloud, config: RegistrationConfig) -> FreeFormDeformation:
-    """The free-form deformation that a configuration describes, around an implant."""
-    grid = default_grid(cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
-    return FreeFormDeformation(grid, prior=config.bending_prior)
 
 
 def build_scene(
@@ -68,7 +36,7 @@ def build_scene(
     components: Sequence[Component] = (),
     implant_to_world: Tensor | None = None,
     holes: Sequence[Hole] = (),
-    deformation: DeformationFactory = free_form,
+    deformation: DeformationFactory = deformation_of,
     intensity: IntensityModel | None = None,
 ) -> Scene:
     """The scene of a registration at its start.
@@ -80,7 +48,7 @@ def build_scene(
         components: Of the one implant, see :class:`Implant`.
         implant_to_world: Of the one implant.
         holes: Of the one implant.
-        deformation: Makes the deformation of an implant.
+        deformation: Makes the deformation of ``(implant, config)``.
         intensity: Model in place of the one that the options describe; its path lengths are those of the implants'
             materials, in their order, then of screws' materials, then of components' materials.
 
@@ -96,7 +64,7 @@ def build_scene(
     assemblies = [
         Assembly(
             one.cloud,
-            deformation(one.cloud, config),
+            deformation(one, config),
             implant_to_world=one.implant_to_world,
             material=one.material or default,
             components=one.components,
@@ -134,7 +102,7 @@ def register(
     components: Sequence[Component] = (),
     implant_to_world: Tensor | None = None,
     holes: Sequence[Hole] = (),
-    deformation: DeformationFactory = free_form,
+    deformation: DeformationFactory = deformation_of,
     intensity: IntensityModel | None = None,
     similarity: SimilarityFactory | None = None,
     penalties: Sequence[Penalty] = (),
@@ -154,7 +122,7 @@ def register(
         components: Of the one implant, see :class:`Implant`.
         implant_to_world: Approximate pose (4, 4) of the one implant; the identity when None.
         holes: Of the one implant.
-        deformation: Makes the deformation of an implant: the free-form deformation of the options, or your own model.
+        deformation: Makes the deformation of ``(implant, config)``: the one that the options name, or your own model.
         intensity: Model in place of the one that the options describe, see :func:`build_scene`.
         similarity: Makes the data term of ``(fixed, mask, weights)``, in place of the stages' own.
         penalties: Functions of the K candidates of a :class:`torchkcreg.scene.State` to (K,), beside the priors.

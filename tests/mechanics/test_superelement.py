@@ -1,0 +1,150 @@
+"""An implant condensed to the loads at its holds: balance, completeness, finite rotations, files."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import trimesh
+
+from torchkcreg.deformation import FiniteElementDeformation, Level, deformation_from_dict
+from torchkcreg.implant import ImplantPointCloud, find_holes
+from torchkcreg.mechanics import ElasticBody, Hold, LoadPrior, Superelement, holds_of
+from torchkcreg.mechanics.holds import unit_loads
+from torchkcreg.physics import elastic_constants
+from torchkcreg.plain import plain
+from torchkcreg.simulation import locking_plate
+
+STEEL = elastic_constants("steel")
+LONG = 100.0
+HOLDS = tuple(Hold(f"at {z:.0f}", (0.0, 0.0, z), 4.0) for z in (-45.0, -15.0, 15.0, 45.0))
+
+
+@pytest.fixture(scope="module")
+def bar() -> ImplantPointCloud:
+    return ImplantPointCloud.from_mesh(trimesh.creation.box((10.0, 4.0, LONG)), 0.4)
+
+
+@pytest.fixture(scope="module")
+def element(bar) -> Superelement:
+    return Superelement.of(bar, STEEL, HOLDS)
+
+
+def test_the_loads_of_every_way_to_bend_are_in_balance(element: Superelement) -> None:
+    places = torch.tensor([h.center for h in HOLDS]).double()
+    for loads in (element.loads, element.stiff):
+        forces, moments = loads[..., :3], loads[..., 3:]
+        size = float(loads.abs().max())
+        assert float(forces.sum(1).abs().max()) < 1e-9 * size
+        turning = moments + torch.linalg.cross(places.expand_as(forces), forces, dim=-1)
+        assert float(turning.sum(1).abs().max()) < 1e-8 * size
+    assert len(element.loads) + len(element.stiff) == 6 * len(HOLDS) - 6
+
+
+def test_amounts_are_millimetres_and_softest_first(element: Superelement, bar: ImplantPointCloud) -> None:
+    points, share = bar.points.double(), (bar.volumes / bar.volumes.sum()).double()
+    deformation = FiniteElementDeformation(element)
+    for number in range(3):
+        deformation.reset()
+        deformation.amounts.data[number] = 1e-3
+        moved = deformation.displacement(points)
+        assert float((share[:, None] * moved.detach() ** 2).sum().sqrt()) == pytest.approx(1e-3, rel=0.01)
+    assert bool((element.expected.diff() <= 0).all()) and float(element.expected[-1]) > 1e-3
+
+
+def test_small_amounts_give_the_displacements_of_the_whole_body(element: Superelement, bar: ImplantPointCloud) -> None:
+    body = ElasticBody(bar, STEEL)
+    where, forces = unit_loads(bar, HOLDS)
+    flat = element.loads[2].flatten() * 1e-4
+    nodal = sum(float(f) * body.response([p], [u]) for f, p, u in zip(flat, where, forces, strict=True))
+    deformation = FiniteElementDeformation(element)
+    deformation.amounts.data[2] = 1e-4
+    points = bar.points[::37].double()
+    wanted = body.displacement(points, nodal)[0]
+    torch.testing.assert_close(deformation.displacement(points), wanted, atol=2e-8, rtol=0)
+
+
+def test_a_bar_that_is_bent_far_keeps_its_length_and_becomes_an_arc(bar: ImplantPointCloud) -> None:
+    ends = (Hold("low", (0.0, 0.0, -46.0), 4.5), Hold("high", (0.0, 0.0, 46.0), 4.5))
+    element = Superelement.of(bar, STEEL, ends)
+    loads = element.loads[:, :, 3]  # moments about x
+    bending = int((loads[:, 1] - loads[:, 0]).abs().div(element.loads.flatten(1).norm(dim=1)).argmax())
+    deformation = FiniteElementDeformation(element)
+    deformation.amounts.data[bending] = 1.0  # some 10 degrees between the holds, more than a plate survives
+    along = torch.linspace(-30, 30, 61).double()
+    axis = torch.stack([0 * along, 0 * along, along], dim=-1)
+    moved = deformation(axis).detach()
+    lengths = moved.diff(dim=0).norm(dim=-1)
+    torch.testing.assert_close(lengths, torch.ones_like(lengths), atol=5e-4, rtol=0)
+    tangents = moved.diff(dim=0) / lengths[:, None]
+    turn = math.degrees(math.acos(float(tangents[0] @ tangents[-1])))
+    assert turn > 5
+    chord = float((moved[-1] - moved[0]).norm())
+    radius = 59 / math.radians(turn)
+    assert chord == pytest.approx(2 * radius * math.sin(30 / radius), abs=0.02)
+
+
+def test_motions_and_deformations_agree_and_the_rigid_part_goes_to_the_pose(element, bar) -> None:
+    deformation = FiniteElementDeformation(element)
+    deformation.amounts.data[:4] = torch.tensor([1.0, -0.5, 0.2, 0.1]).double()
+    points = bar.points[::53].double()
+    generator = torch.Generator().manual_seed(0)
+    for level in (Level(1), Level(2), Level(20, 40)):
+        motion = deformation.motion(bar, level)
+        torch.testing.assert_close(
+            motion.displacement(points, motion.at_rest())[0], deformation.displacement(points), atol=1e-10, rtol=0
+        )
+        steps = 0.5 * torch.randn(motion.num_parameters, dtype=torch.float64, generator=generator)
+        moved = points + motion.displacement(points, steps[None])[0]
+        common = motion.accept(steps)
+        after = deformation(points) @ common[:3, :3].T + common[:3, 3]
+        torch.testing.assert_close(after, moved, atol=5e-3, rtol=0)
+
+
+def test_the_motion_has_the_gradients_it_says(element, bar) -> None:
+    motion = FiniteElementDeformation(element).motion(bar, Level(20, 40))
+    points = bar.points[::997].double()
+    steps = 0.1 * torch.ones(1, motion.num_parameters, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: motion.displacement(points, s), steps, atol=1e-6)
+    still = torch.zeros(1, motion.num_parameters, dtype=torch.float64)
+    assert float(motion.penalty(still)) == 0 and float(motion.penalty(steps.detach())) > 0
+
+
+def test_levels_free_as_many_ways_as_groups_or_modes_have_numbers(element, bar) -> None:
+    deformation = FiniteElementDeformation(element)
+    counts = [deformation.motion(bar, level).num_parameters for level in (Level(1), Level(2), Level(20, 9), Level(20))]
+    assert counts == [6, 12, 9, 6 + element.num_amounts]
+
+
+def test_files_give_it_back(element, bar) -> None:
+    deformation = FiniteElementDeformation(element)
+    deformation.amounts.data[0] = 1.5
+    content = deformation.to_dict()
+    points = bar.points[::29].double()
+    for form in (content, plain(content)):
+        again = deformation_from_dict(form)
+        torch.testing.assert_close(again.displacement(points), deformation.displacement(points), atol=1e-6, rtol=0)
+    assert again.superelement.holds == HOLDS
+    del content["superelement"]["loads"]
+    with pytest.raises(ValueError, match="'loads' of a superelement is missing"):
+        deformation_from_dict(content)
+
+
+def test_a_stronger_prior_expects_more_and_one_hold_is_not_enough(bar, element) -> None:
+    twice = Superelement.of(bar, STEEL, HOLDS, prior=LoadPrior(600.0, 10_000.0))
+    torch.testing.assert_close(twice.expected[:5], 2 * element.expected[:5], rtol=1e-6, atol=0)
+    with pytest.raises(ValueError, match="held in two places or more, got 1"):
+        Superelement.of(bar, STEEL, HOLDS[:1])
+
+
+def test_plates_are_held_at_their_holes_and_bars_along_their_length(bar) -> None:
+    mesh = locking_plate(length=100.0, num_holes=5, hole_offset=2.0)
+    plate = ImplantPointCloud.from_mesh(mesh, 0.5)
+    holes = holds_of(plate, find_holes(mesh))
+    assert [h.name for h in holes] == [f"hole {n}" for n in range(1, 6)]  # combination holes count once
+    assert all(len(h.nodes(plate.points)) > 20 for h in holes)
+    patches = holds_of(bar)
+    assert len(patches) >= 3 and patches[0].name == "patch 1"
+    assert patches[-1].center[2] - patches[0].center[2] > 0.6 * LONG
+    assert holds_of(plate, find_holes(mesh)[:2])[0].name == "patch 1"  # too few to hold it

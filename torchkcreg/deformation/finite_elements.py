@@ -1,0 +1,162 @@
+"""An implant that bends as its shape and alloy let it, under loads where it may be held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchkcreg.deformation.model import Deformation, Level, Motion
+from torchkcreg.deformation.rigid_motion import RigidMotion
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.mechanics import Superelement
+
+_BEYOND_MM = 25.0
+
+
+class FiniteElementDeformation(Deformation):
+    """Displacements of an elastic body whose loads at its holds are unknown.
+
+    Strains are linear in the loads, rotations finite: sections along the implant turn and shift against their
+    neighbours as the superelement says, which is integrated along it, and what of the linear displacements is no motion
+    of sections (a section's own distortion, a few micrometres) is added.
+
+    Args:
+        superelement: Of the implant.
+        amounts: Of each of its ways to bend, mm; zero when None.
+        load_weight: Loss for an amount that is a standard deviation of the prior.
+
+    Attributes:
+        amounts: Parameter (A,), float64.
+    """
+
+    model = "fe"
+
+    def __init__(self, superelement: Superelement, amounts: Tensor | None = None, *, load_weight: float = 5e-4) -> None:
+        super().__init__()
+        self.superelement, self.load_weight = superelement, load_weight
+        start = torch.zeros_like(superelement.expected) if amounts is None else amounts.detach().clone()
+        self.amounts = nn.Parameter(start.to(superelement.expected))
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> FiniteElementDeformation:
+        super()._apply(fn, recurse)
+        self.amounts.data = self.amounts.data.double()
+        self.superelement = self.superelement.to(self.amounts.device)
+        return self
+
+    def displacement(self, points: Tensor) -> Tensor:
+        """Displacements u, mm, of points (..., N, 3) in the implant's frame."""
+        flat, element = points.reshape(-1, 3).double(), self.superelement
+        moved = section_features(element, flat) @ section_coefficients(element, self.amounts[None])[0]
+        moved = moved + element.remainder(flat, self.amounts[None])[0]
+        return moved.reshape(points.shape).to(points)
+
+    def motion(self, cloud: ImplantPointCloud, level: Level) -> Motion:
+        """Rotation and translation of the whole, and as many of the softest ways to bend as the level allows.
+
+        G groups have 6 G numbers to move by, m modes m of them.
+        """
+        if level.is_rigid:
+            return RigidMotion(self, cloud)
+        wanted = level.modes if level.modes is not None else RigidMotion.num_parameters * level.groups
+        free = min(wanted - RigidMotion.num_parameters, self.superelement.num_amounts)
+        return FiniteElementMotion(self, cloud, free)
+
+    def outside(self, points: Tensor) -> Tensor:
+        """True for points (..., 3) well beyond the implant's ends, where its end sections' motion goes on."""
+        sections = self.superelement.sections
+        height = points.double() @ sections.axis
+        return (height < sections.heights[0] - _BEYOND_MM) | (height > sections.heights[-1] + _BEYOND_MM)
+
+    def prior(self, amounts: Tensor) -> Tensor:
+        """What speaks against amounts (K, A) but the images, shape (K,): how strong the loads at the holds are."""
+        return self.load_weight * (amounts / self.superelement.expected).square().sum(-1)
+
+    @property
+    def loads(self) -> Tensor:
+        """Force and moment at each hold, (H, 6), N and N mm, in the implant's axes."""
+        return self.superelement.loads_at(self.amounts.detach())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Superelement and amounts."""
+        content = self.superelement.to("cpu").to_dict()
+        amounts = self.amounts.detach().cpu()
+        return {"model": self.model, "amounts": amounts, "load_weight": self.load_weight, "superelement": content}
+
+
+class FiniteElementMotion(Motion):
+    """Rotation and translation of the whole implant, and steps of the softest ways to bend, all in mm.
+
+    Args:
+        deformation: Where the motion starts.
+        cloud: The implant; its middle is what it turns about.
+        num_free: How many amounts may change.
+    """
+
+    def __init__(self, deformation: FiniteElementDeformation, cloud: ImplantPointCloud, num_free: int) -> None:
+        self.deformation, self.num_free = deformation, num_free
+        self.start = deformation.amounts.detach().clone()
+        self.whole = RigidMotion(deformation, cloud)
+        self.num_parameters = self.whole.num_parameters + num_free
+
+    def features(self, points: Tensor) -> Tensor:
+        """Those of the sections (4 S), then each way's remainder (3 A)."""
+        points, element = points.double(), self.deformation.superelement
+        rest = element.remainder(points, torch.eye(element.num_amounts, dtype=points.dtype, device=points.device))
+        return torch.cat([section_features(element, points), rest.permute(1, 0, 2).flatten(1)], dim=-1)
+
+    def coefficients(self, steps: Tensor) -> Tensor:
+        """Motions of the sections, then amounts, turned and shifted as a whole."""
+        steps = steps.double()
+        amounts, (turn, shift) = self._amounts(steps), self.whole.turn_and_shift(steps)
+        center = self.whole.center.to(turn)
+        shift = center + shift - (turn @ center[:, None])[..., 0]
+        sections = section_coefficients(self.deformation.superelement, amounts, turn, shift)
+        return torch.cat([sections, (amounts[..., None, None] * turn[:, None].mT).flatten(1, 2)], dim=1)
+
+    def penalty(self, steps: Tensor) -> Tensor:
+        """The deformation's prior."""
+        return self.deformation.prior(self._amounts(steps))
+
+    @torch.no_grad()
+    def accept(self, steps: Tensor) -> Tensor:
+        """The rotation and translation; the amounts have gone into the deformation."""
+        self.deformation.amounts.copy_(self._amounts(steps[None])[0])
+        return self.whole.accept(steps[:6])
+
+    def _amounts(self, steps: Tensor) -> Tensor:
+        moved = self.start[: self.num_free] + steps[:, self.whole.num_parameters :]
+        return torch.cat([moved, self.start[self.num_free :].to(moved).expand(len(steps), -1)], dim=-1)
+
+
+def section_features(superelement: Superelement, points: Tensor) -> Tensor:
+    """What points (N, 3) need to know of S sections, (N, 4 S): their weights, and these times the arms from them."""
+    weights = superelement.sections.weights(points)
+    arms = (points[:, None] - superelement.sections.centers) * weights[..., None]
+    return torch.cat([weights, arms.flatten(1)], dim=-1)
+
+
+def section_coefficients(
+    superelement: Superelement, amounts: Tensor, turn: Tensor | None = None, shift: Tensor | None = None
+) -> Tensor:
+    """Shifts and rotations less one of the sections, (K, 4 S, 3), for amounts (K, A).
+
+    Args:
+        superelement: Of the implant.
+        amounts: Of its ways to bend.
+        turn: Rotations (K, 3, 3) of the whole.
+        shift: Translations (K, 3) after them.
+    """
+    sections, amounts = superelement.sections, amounts.double()
+    rotations, places = sections.chained(
+        torch.einsum("ka,asi->ksi", amounts, superelement.shifts),
+        torch.einsum("ka,asi->ksi", amounts, superelement.turns),
+    )
+    if turn is not None:
+        places, rotations = (turn[:, None] @ places[..., None])[..., 0], turn[:, None] @ rotations
+    if shift is not None:
+        places = places + shift[:, None]
+    same = torch.eye(3, dtype=amounts.dtype, device=amounts.device)
+    return torch.cat([places - sections.centers, (rotations.mT - same).flatten(1, 2)], dim=1)

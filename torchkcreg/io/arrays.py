@@ -1,0 +1,67 @@
+"""Large arrays beside a JSON file: the file names them, an NPZ holds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchkcreg.io.files import atomic_path
+
+_KEY = "array"
+_MOST_IN_JSON = 4096
+
+
+def without_arrays(content: Any, where: str = "") -> tuple[Any, dict[str, Tensor]]:
+    """The content with ``{"array": name}`` in place of every tensor of more than 4096 numbers, and these by name."""
+    if isinstance(content, Tensor):
+        return ({_KEY: where}, {where: content}) if content.numel() > _MOST_IN_JSON else (content, {})
+    pairs: Any = {}
+    if isinstance(content, dict):
+        pairs = content.items()
+    elif isinstance(content, (list, tuple)):
+        pairs = enumerate(content)
+    else:
+        return content, {}
+    parts = {key: without_arrays(value, f"{where}.{key}" if where else str(key)) for key, value in pairs}
+    arrays = {name: array for _, found in parts.values() for name, array in found.items()}
+    if isinstance(content, dict):
+        return {key: part for key, (part, _) in parts.items()}, arrays
+    return [part for part, _ in parts.values()], arrays
+
+
+def with_arrays(content: Any, path: Path) -> Any:
+    """The content with its arrays out of an NPZ file.
+
+    Raises:
+        FileNotFoundError: The file is needed and not there.
+        ValueError: It lacks an array, or is damaged.
+    """
+    if not isinstance(content, (dict, list)):
+        return content
+    if isinstance(content, dict) and content.keys() == {_KEY}:
+        return _array(path, content[_KEY])
+    if isinstance(content, dict):
+        return {key: with_arrays(value, path) for key, value in content.items()}
+    return [with_arrays(value, path) for value in content]
+
+
+def write_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
+    """Nothing; writes an NPZ file, whole or not at all."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **{name: array.detach().cpu().numpy() for name, array in arrays.items()})  # type: ignore[arg-type]
+
+
+def _array(path: Path, name: str) -> Tensor:
+    if not path.is_file():
+        raise FileNotFoundError(f"arrays file {path}, which a deformation refers to, does not exist")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return torch.from_numpy(stored[name])
+    except KeyError:
+        raise ValueError(f"arrays file {path} has no array {name!r}") from None
+    except Exception as error:  # numpy's, zipfile's and zlib's own
+        raise ValueError(f"arrays file {path} cannot be read: {error}") from error

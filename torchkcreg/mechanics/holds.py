@@ -1,0 +1,119 @@
+"""Where an implant may be held: its holes, or patches along one that has none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchkcreg.implant import Hole, ImplantPointCloud
+
+_RIM_MM = 1.5  # around a hole's wall: what a screw's head presses on
+_JOINED = 2.2  # radii between centres: round holes that open into each other
+_SPACING = 3.0  # of patches, in widths of the implant's cross-section; at least
+_MOST_PATCHES = 12
+_FEWEST_HOLES = 3
+_SPANNED = 0.5  # of the implant's length, by the holes that hold it
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A place where an implant may be held and loaded.
+
+    Attributes:
+        name: How results refer to it.
+        center: Where its force acts and about what its moment turns, (3,) in the implant's frame, mm.
+        radius: Nodes within it belong to the hold, mm.
+        axis: Direction of a hole's axis: the radius is meant across it then, and its half depth along it.
+        half_depth: mm.
+    """
+
+    name: str
+    center: tuple[float, float, float]
+    radius: float
+    axis: tuple[float, float, float] | None = None
+    half_depth: float = 0.0
+
+    def nodes(self, points: Tensor) -> Tensor:
+        """Numbers of the nodes (N, 3) that belong to the hold; the nearest where none is near enough."""
+        away = points.double() - points.new_tensor(self.center, dtype=torch.float64)
+        distance = away.norm(dim=-1)
+        if self.axis is None:
+            inside = distance <= self.radius
+        else:
+            along = away @ points.new_tensor(self.axis, dtype=torch.float64)
+            across = (distance.square() - along.square()).clamp_min(0).sqrt()
+            inside = (across <= self.radius) & (along.abs() <= self.half_depth + _RIM_MM)
+        found = inside.nonzero().flatten()
+        return found if len(found) >= 3 else distance.argsort()[:3]
+
+
+def holds_of(cloud: ImplantPointCloud, holes: Sequence[Hole] = ()) -> list[Hold]:
+    """Where an implant may be held: its holes, or patches along it where holes leave more than half of it free."""
+    middle, axes, extents = (x.double() for x in cloud.principal_axes())
+    along, length = axes[-1], float(extents[-1])
+    places: list[list[Hole]] = []
+    for hole in holes:
+        joined = [p for p in places if min(np.linalg.norm(h.center - hole.center) for h in p) < _JOINED * hole.radius]
+        if joined:
+            joined[0].append(hole)
+        else:
+            places.append([hole])
+    holds = [_at(number, place) for number, place in enumerate(places, start=1)]
+    heights = [float(torch.tensor(h.center).double() @ along.cpu()) for h in holds]
+    if len(holds) >= _FEWEST_HOLES and max(heights) - min(heights) >= _SPANNED * length:
+        return holds
+    return _patches(cloud, middle, along, length, float(extents[:-1].max()))
+
+
+def _at(number: int, holes: Sequence[Hole]) -> Hold:
+    """The place of one hole, or of those that a combination hole is made of."""
+    center, first = np.mean([hole.center for hole in holes], axis=0), holes[0]
+    reach = max(float(np.linalg.norm(hole.center - center)) + hole.radius for hole in holes) + _RIM_MM
+    middle, axis = (tuple(float(x) for x in vector) for vector in (center, first.axis))
+    return Hold(f"hole {number}", middle, reach, axis, first.depth / 2)  # type: ignore[arg-type]
+
+
+def _patches(cloud: ImplantPointCloud, middle: Tensor, along: Tensor, length: float, width: float) -> list[Hold]:
+    number = max(_FEWEST_HOLES, min(_MOST_PATCHES, round(length / (_SPACING * width)) + 1))
+    points = cloud.points.double()
+    height = (points - middle) @ along
+    low, high = float(height.min()), float(height.max())
+    spacing = (high - low) / number
+    holds = []
+    for index in range(number):
+        here = (height - (low + (index + 0.5) * spacing)).abs() <= spacing / 2
+        center = points[here if bool(here.any()) else slice(None)].mean(0)
+        holds.append(Hold(f"patch {index + 1}", tuple(center.tolist()), min(width, spacing) / 2))
+    return holds
+
+
+def unit_loads(cloud: ImplantPointCloud, holds: Sequence[Hold]) -> tuple[list[Tensor], list[Tensor]]:
+    """Where each of six unit loads of each hold acts, (P, 3), and its forces there: 1 N along, 1 N mm about each axis.
+
+    The metal of a hold moves nearly as one: forces are spread over it as those of a rigid body, moments about the
+    hold's centre.
+    """
+    where, forces = [], []
+    for hold in holds:
+        chosen = hold.nodes(cloud.points)
+        points, volumes = cloud.points[chosen].double(), cloud.volumes[chosen].double()[:, None]
+        arms = points - points.new_tensor(hold.center)
+        axes = torch.eye(3, dtype=points.dtype)
+        fields = [axis.expand_as(points) for axis in axes] + [
+            torch.linalg.cross(axis.expand_as(arms), arms) for axis in axes
+        ]
+        basis = torch.stack(fields)  # rigid motions of the hold's nodes
+        spread = basis * volumes
+        wrench = torch.stack([_wrench(arms, field) for field in spread], dim=-1)  # (6, 6): what each field amounts to
+        loads = torch.einsum("kl,kpi->lpi", torch.linalg.inv(wrench), spread)
+        where += [points] * 6
+        forces += list(loads)
+    return where, forces
+
+
+def _wrench(arms: Tensor, forces: Tensor) -> Tensor:
+    return torch.cat([forces.sum(0), torch.linalg.cross(arms, forces).sum(0)])
