@@ -12,9 +12,15 @@ class ParameterBlock:
     """Steps from where something is, so scaled that one of 1 changes an image about as much as a motion by 1 mm.
 
     A vector of zeros leaves all as it is. Derive from it and set ``num_parameters``; the rest has defaults.
+
+    Attributes:
+        num_parameters: How many there are.
+        loss_of_deviation: What the penalty is for a parameter that is one standard deviation off where a prior expects
+            it, if the penalty is the square of such deviations; 0 if it is none.
     """
 
     num_parameters: int
+    loss_of_deviation: float = 0.0
 
     def clamp(self, steps: Tensor) -> Tensor:
         """Steps (K, D) within their bounds; as they are by default."""

@@ -8,7 +8,7 @@ import torch
 from small_scene import RIGID, image, plate
 
 from torchkcreg.io import RunFolder, read_run
-from torchkcreg.mechanics import Hold
+from torchkcreg.mechanics import CarriedLoad, Hold
 from torchkcreg.registration import Implant, RegistrationConfig, RegistrationResult, Stage, build_scene, register
 
 HOLDS = [Hold(f"at {z:.0f}", (0.0, 0.0, z), 4.0) for z in (-22.0, -7.0, 7.0, 22.0)]
@@ -32,6 +32,17 @@ def test_the_bend_and_the_load_are_found(found) -> None:
     error = (result.warp(plate().points.double()) - points).norm(dim=-1)
     assert float(error.max()) < 0.02
     assert float((result.deformation.loads - loads)[:, 3:].abs().max()) < 0.1 * float(loads[:, 3:].abs().max())
+
+
+def test_the_truth_lies_about_as_far_off_as_the_loads_say(found) -> None:
+    result, loads, _ = found
+    carried = CarriedLoad.of(
+        result.deformation.superelement, result.deformation.amounts.detach(), result.deformation.covariance
+    )
+    off = carried.hold_loads - loads @ torch.block_diag(carried.axes, carried.axes).mT
+    assert float((off.abs() / carried.hold_std).max()) < 4
+    nothing_seen = CarriedLoad.of(result.deformation.superelement, result.deformation.amounts.detach())
+    assert float((carried.section_std / nothing_seen.section_std)[60, [3, 5]].max()) < 0.9  # less than without images
 
 
 def test_a_run_folder_keeps_the_body_beside_its_json(found, tmp_path) -> None:

@@ -27,6 +27,7 @@ class FiniteElementDeformation(Deformation):
         superelement: Of the implant.
         amounts: Of each of its ways to bend, mm; zero when None.
         load_weight: Loss for an amount that is a standard deviation of the prior.
+        covariance: Of the amounts, (A, A), mm^2, where a registration has found it.
 
     Attributes:
         amounts: Parameter (A,), float64.
@@ -34,9 +35,16 @@ class FiniteElementDeformation(Deformation):
 
     model = "fe"
 
-    def __init__(self, superelement: Superelement, amounts: Tensor | None = None, *, load_weight: float = 5e-4) -> None:
+    def __init__(
+        self,
+        superelement: Superelement,
+        amounts: Tensor | None = None,
+        *,
+        load_weight: float = 1e-5,
+        covariance: Tensor | None = None,
+    ) -> None:
         super().__init__()
-        self.superelement, self.load_weight = superelement, load_weight
+        self.superelement, self.load_weight, self.covariance = superelement, load_weight, covariance
         start = torch.zeros_like(superelement.expected) if amounts is None else amounts.detach().clone()
         self.amounts = nn.Parameter(start.to(superelement.expected))
 
@@ -44,6 +52,8 @@ class FiniteElementDeformation(Deformation):
         super()._apply(fn, recurse)
         self.amounts.data = self.amounts.data.double()
         self.superelement = self.superelement.to(self.amounts.device)
+        if self.covariance is not None:
+            self.covariance = self.covariance.to(self.amounts.device)
         return self
 
     def displacement(self, points: Tensor) -> Tensor:
@@ -83,7 +93,14 @@ class FiniteElementDeformation(Deformation):
         """Superelement and amounts."""
         content = self.superelement.to("cpu").to_dict()
         amounts = self.amounts.detach().cpu()
-        return {"model": self.model, "amounts": amounts, "load_weight": self.load_weight, "superelement": content}
+        covariance = None if self.covariance is None else self.covariance.cpu()
+        return {
+            "model": self.model,
+            "amounts": amounts,
+            "covariance": covariance,
+            "load_weight": self.load_weight,
+            "superelement": content,
+        }
 
 
 class FiniteElementMotion(Motion):
@@ -98,6 +115,7 @@ class FiniteElementMotion(Motion):
     def __init__(self, deformation: FiniteElementDeformation, cloud: ImplantPointCloud, num_free: int) -> None:
         self.deformation, self.num_free = deformation, num_free
         self.start = deformation.amounts.detach().clone()
+        self.loss_of_deviation = deformation.load_weight
         self.whole = RigidMotion(deformation, cloud)
         self.num_parameters = self.whole.num_parameters + num_free
 
@@ -125,6 +143,13 @@ class FiniteElementMotion(Motion):
         """The rotation and translation; the amounts have gone into the deformation."""
         self.deformation.amounts.copy_(self._amounts(steps[None])[0])
         return self.whole.accept(steps[:6])
+
+    def keep_covariance(self, covariance: Tensor) -> None:
+        """That of the amounts; those that were not free have what the prior expects."""
+        free = self.whole.num_parameters
+        whole = torch.diag(self.deformation.superelement.expected.square())
+        whole[: self.num_free, : self.num_free] = covariance[free:, free:].to(whole)
+        self.deformation.covariance = whole
 
     def _amounts(self, steps: Tensor) -> Tensor:
         moved = self.start[: self.num_free] + steps[:, self.whole.num_parameters :]

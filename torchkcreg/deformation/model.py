@@ -53,6 +53,9 @@ class Motion(ParameterBlock, ABC):
         ``pose (x + u(x))`` with the steps is ``pose C (x + u'(x))`` with the motion C and the deformation's new u'.
         """
 
+    def keep_covariance(self, covariance: Tensor) -> None:
+        """Hears, at a registration's end, the covariance (D, D) of the steps, mm^2; forgets it by default."""
+
     def displacement(self, points: Tensor, steps: Tensor) -> Tensor:
         """Displacements (K, N, 3) of points (N, 3) after steps (K, D), in the implant's frame, mm."""
         return self.features(points) @ self.coefficients(steps)

@@ -40,8 +40,13 @@ def _free_form(content: dict[str, Any]) -> FreeFormDeformation:
 def _finite_elements(content: dict[str, Any]) -> FiniteElementDeformation:
     require_keys(content, ("superelement", "amounts", "load_weight"), " of a deformation")
     superelement = Superelement.from_dict(content["superelement"])
-    amounts = finite_array(content["amounts"], (superelement.num_amounts,), "amounts")
-    return FiniteElementDeformation(superelement, amounts, load_weight=float(content["load_weight"]))
+    number, covariance = superelement.num_amounts, content.get("covariance")
+    return FiniteElementDeformation(
+        superelement,
+        finite_array(content["amounts"], (number,), "amounts"),
+        load_weight=float(content["load_weight"]),
+        covariance=None if covariance is None else finite_array(covariance, (number, number), "covariance"),
+    )
 
 
 _READERS = {"fe": _finite_elements, "ffd": _free_form, "rigid": lambda content: RigidDeformation()}

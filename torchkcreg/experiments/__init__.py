@@ -5,6 +5,7 @@ from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.describe import describe, describe_installation
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
+from torchkcreg.experiments.load_files import ImplantLoad, load_files
 from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
 from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles, ReconstructionOptions
 from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
@@ -15,6 +16,7 @@ __all__ = [
     "CaptureStudy",
     "CaptureTrial",
     "FileEvaluation",
+    "ImplantLoad",
     "ReconstructionFiles",
     "ReconstructionOptions",
     "RegistrationFiles",
@@ -25,6 +27,7 @@ __all__ = [
     "describe_installation",
     "draw_registration",
     "evaluate_files",
+    "load_files",
     "reconstruct_files",
     "register_files",
     "register_seeds",

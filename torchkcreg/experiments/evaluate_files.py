@@ -19,8 +19,9 @@ from torchkcreg.evaluation import (
     point_errors,
 )
 from torchkcreg.evaluation.shape import ReferenceKind
+from torchkcreg.experiments.mesh_of_run import mesh_of_run
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.io import read_config, read_mesh, read_points, read_reference, read_run, write_figure
+from torchkcreg.io import read_mesh, read_points, read_reference, read_run, write_figure
 from torchkcreg.registration import RegistrationResult
 from torchkcreg.visualization import displacement_figure, error_map_figure, histogram_figure
 
@@ -92,7 +93,7 @@ def evaluate_files(
         pairs = read_points(points), read_points(truth)
         metrics = evaluate(result, *pairs)
     if reference is not None or figures is not None:
-        mesh = read_mesh(implant or _implant_of(run_folder))
+        mesh = read_mesh(implant or mesh_of_run(run_folder))
     if reference is not None and mesh is not None:
         true = read_reference(reference)
         pitch = result.config.pitch_mm
@@ -101,17 +102,6 @@ def evaluate_files(
         shape = evaluate_shape(surface, nodes, true, pitch_mm=pitch, reference_kind=reference_kind)
     pictures = _draw(figures, result, mesh, shape, pairs) if figures is not None and mesh is not None else ()
     return FileEvaluation(metrics, shape, tuple(pictures))
-
-
-def _implant_of(run_folder: Path) -> Path:
-    """The mesh that a run was started with."""
-    files = read_config(Path(run_folder) / "config.yaml").get("files")
-    named = files.get("implant") if isinstance(files, dict) else None
-    path: str | None = named[0] if isinstance(named, list) and named else named  # type: ignore[assignment]
-    if path is None or not Path(path).is_file():
-        where = "names none" if path is None else f"names {path}, which is not there"
-        raise FileNotFoundError(f"the implant's undeformed mesh is needed, and run folder {run_folder} {where}")
-    return Path(path)
 
 
 def _draw(

@@ -20,6 +20,7 @@ from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
 from .versions import versions
 from .volumes import read_volume, write_volume
+from .vtu import write_surface_vtu
 
 __all__ = [
     "Projections",
@@ -55,5 +56,6 @@ __all__ = [
     "write_points",
     "write_projections",
     "write_spectrum",
+    "write_surface_vtu",
     "write_volume",
 ]

@@ -1,6 +1,7 @@
 """An implant as an elastic body: stiffness from its own nodes, without a mesh; displacements, loads and stresses."""
 
 from torchkcreg.mechanics.body import ElasticBody
+from torchkcreg.mechanics.carried import CarriedLoad, node_stresses
 from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for
 from torchkcreg.mechanics.holds import Hold, holds_of
 from torchkcreg.mechanics.sections import Sections
@@ -9,6 +10,7 @@ from torchkcreg.mechanics.stress import von_mises
 from torchkcreg.mechanics.superelement import LoadPrior, Superelement
 
 __all__ = [
+    "CarriedLoad",
     "ElasticBody",
     "Hexahedra",
     "Hold",
@@ -17,6 +19,7 @@ __all__ = [
     "Superelement",
     "edge_for",
     "holds_of",
+    "node_stresses",
     "stiffness_matrix",
     "von_mises",
 ]

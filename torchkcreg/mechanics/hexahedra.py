@@ -70,20 +70,25 @@ class Hexahedra:
         """Of all cubes together."""
         return len(self.positions)
 
-    def locate(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def locate(self, points: Tensor, among: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The cube (P,) that each point (P, 3) of the implant's frame is in, and where in it (P, 3), from -1 to 1.
 
         Points beside the cubes belong to the nearest one, of which they are then outside.
+
+        Args:
+            points: In the implant's frame.
+            among: Which cubes are meant, (E,), bool; all when None.
         """
         local = transform_points(invert_rigid(self.frame), points.double())
         shape = torch.tensor(self.number_of.shape, device=local.device)
         index = torch.minimum((local / self.edge).floor().long().clamp_min(0), shape - 1)
         cube = self.number_of[tuple(index.unbind(-1))]
-        astray = (cube < 0).nonzero().flatten()
+        meant = torch.ones(len(self.cells), dtype=torch.bool, device=local.device) if among is None else among
+        astray, candidates = ((cube < 0) | ~meant[cube]).nonzero().flatten(), meant.nonzero().flatten()
         if len(astray):
-            middles = (self.cells.double() + 0.5) * self.edge
+            middles = (self.cells[candidates].double() + 0.5) * self.edge
             for some in astray.split(4096):
-                cube[some] = torch.cdist(local[some], middles).argmin(-1)
+                cube[some] = candidates[torch.cdist(local[some], middles).argmin(-1)]
         inside = 2 * (local / self.edge - self.cells[cube]) - 1
         return cube, inside
 

@@ -12,6 +12,8 @@ from torchkcreg.mechanics.hexahedra import Hexahedra
 from torchkcreg.physics import ElasticConstants
 
 _CORNERS = (0, 2, 6, 8, 18, 20, 24, 26)  # of a cube's 27 nodes
+_FULL_ENOUGH = 0.5  # of a cube that is full: what is in it then holds all of its shape functions
+_BEYOND = 2.0  # half edges from a cube's middle, as far as its stresses go on
 
 
 def volumes_in_cubes(hexahedra: Hexahedra, cloud: ImplantPointCloud) -> Tensor:
@@ -27,7 +29,9 @@ def stresses(
     """Stresses (L, P, 3, 3) at points of an implant, N/mm^2, in its axes.
 
     Taken where quadratic shape functions know them best, at the 2 x 2 x 2 places of Barlow (1976) in each cube,
-    extrapolated to the cubes' corners, averaged there over the metal, and linear in between.
+    extrapolated to the cubes' corners, averaged there over the metal, and linear in between. Cubes that hold little
+    metal leave some of their shape functions free and do not take part: what is in them has the stress of the nearest
+    cube that does, continued.
 
     Args:
         hexahedra: Around the implant.
@@ -42,14 +46,14 @@ def stresses(
     nodal = nodal.double()
     gradients = torch.einsum("gaj,leai->legij", slopes, nodal[:, hexahedra.nodes]) @ hexahedra.frame[:3, :3].mT
     outward = torch.einsum("cg,legij->lecij", _trilinear(corners * math.sqrt(3)), _stresses(gradients, constants))
-    nodes = hexahedra.nodes[:, list(_CORNERS)]
-    share = filled[:, None].expand(nodes.shape)
+    nodes, trusted = hexahedra.nodes[:, list(_CORNERS)], filled >= _FULL_ENOUGH * filled.max()
+    share = (filled * trusted)[:, None].expand(nodes.shape)
     sums = outward.new_zeros(len(nodal), hexahedra.num_nodes, 3, 3)
     sums.index_add_(1, nodes.flatten(), (outward * share[..., None, None]).flatten(1, 2))
     whole = share.new_zeros(hexahedra.num_nodes).index_add_(0, nodes.flatten(), share.flatten())
     mean = sums / whole.clamp_min(torch.finfo(whole.dtype).tiny)[:, None, None]
-    cube, inside = hexahedra.locate(points)
-    return torch.einsum("pc,lpcij->lpij", _trilinear(inside.clamp(-1, 1)), mean[:, nodes[cube]])
+    cube, inside = hexahedra.locate(points, trusted)
+    return torch.einsum("pc,lpcij->lpij", _trilinear(inside.clamp(-_BEYOND, _BEYOND)), mean[:, nodes[cube]])
 
 
 def von_mises(stress: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchkcreg.parameters import ParameterBlocks
 from torchkcreg.scene import Assembly
 
 from .objective import Objective
@@ -42,6 +43,8 @@ def diagnose(
 ) -> Diagnostics:
     """What is measured of a scene at the end of its registration; of several implants, the worst.
 
+    Deformations that want to know how sure they are, are told.
+
     Args:
         objective: Of the last stage there.
         gc: Gradient correlation of each view.
@@ -50,11 +53,13 @@ def diagnose(
         rival: Where the implants fitted second best, if several places were tried.
     """
     rest, scene = objective.at_rest, objective.scene
+    covariance = parameter_covariance(objective, rest[0])
+    objective.moves.keep_covariance(covariance)
     seen = [seen_shares(assembly, objective) for assembly in scene]
     return Diagnostics(
         gc=gc,
         misfit=1 - float(objective.similarities(rest).mean()),
-        node_std_mm=node_deviation(objective, rest[0]),
+        node_std_mm=node_deviation(objective, rest[0], covariance),
         seen=[min(shares) for shares in zip(*seen, strict=True)],
         strain=max(assembly.rms_strain() for assembly in scene),
         folds=any(_folds(assembly) for assembly in scene),
@@ -72,13 +77,15 @@ def _folds(assembly: Assembly) -> bool:
 
 
 @torch.no_grad()
-def node_deviation(objective: Objective, parameters: Tensor) -> float:
-    """Expected root mean square error of the implant's nodes at the optimum of a stage, mm.
+def parameter_covariance(objective: Objective, parameters: Tensor) -> Tensor:
+    """Covariance (D, D) of the parameters at the optimum of a stage, mm^2.
 
-    ``C = H^-1 (sum_b g_b g_b^T) H^-1`` (Huber 1967; clusters as in Liang & Zeger 1986): H is the curvature of the loss,
-    penalties included, g_b the share that one block of pixels has in its gradient. The blocks' shares sum to nothing
-    but the penalty's gradient; what they scatter is how far the optimum would move if the blocks had been others. That
-    holds for model error too, which is no noise: what matters is that it hangs together within blocks and not beyond.
+    ``C = H^-1 (sum_b g_b g_b^T + 2 w P) H^-1`` (Huber 1967; clusters as in Liang & Zeger 1986): H is the curvature of
+    the loss, penalties included, g_b the share that one block of pixels has in its gradient. The blocks' shares sum to
+    nothing but the penalty's gradient; what they scatter is how far the optimum would move if the blocks had been
+    others. That holds for model error too, which is no noise: what matters is that it hangs together within blocks and
+    not beyond. Where a penalty is w times the square of deviations from a prior, its curvature P draws the optimum
+    towards what the prior expects, which is as likely off as that says: 2 w P.
 
     Args:
         objective: Of a stage whose parameters are at their optimum.
@@ -90,13 +97,31 @@ def node_deviation(objective: Objective, parameters: Tensor) -> float:
     shares = torch.stack([_block_sums((row * residuals).sum(1), size) for row in jacobian]).double()
     shares = 0.5 / objective.images.num_views * shares
     blocks = max(int((shares != 0).any(0).sum()), 2)
-    inner = blocks / (blocks - 1) * shares @ shares.T
+    inner = blocks / (blocks - 1) * shares @ shares.T + _of_priors(objective.moves, parameters)
     floor = (
         1e-9 * curvature.diagonal().mean() * torch.eye(len(curvature), dtype=curvature.dtype, device=curvature.device)
     )
     bread = torch.linalg.inv(curvature + floor)
+    return bread @ inner @ bread
+
+
+def _of_priors(blocks: ParameterBlocks, parameters: Tensor) -> Tensor:
+    """2 w P of every block, (D, D)."""
+    parts = []
+    for name, steps in blocks.split(parameters).items():
+        block, size = blocks[name], len(steps)
+        part = parameters.new_zeros(size, size)
+        if block.loss_of_deviation:
+            part = torch.func.hessian(lambda p, block=block: block.penalty(p[None])[0])(steps)
+        parts.append(2 * block.loss_of_deviation * part)
+    return torch.block_diag(*parts)
+
+
+@torch.no_grad()
+def node_deviation(objective: Objective, parameters: Tensor, covariance: Tensor) -> float:
+    """Expected root mean square error of the implant's nodes for the parameters' covariance (D, D), mm."""
     moves = _node_moves(objective, parameters)
-    return float(torch.einsum("sd,de,se->", moves, bread @ inner @ bread, moves).clamp_min(0).sqrt())
+    return float(torch.einsum("sd,de,se->", moves, covariance, moves).clamp_min(0).sqrt())
 
 
 def _block_sums(images: Tensor, size: int) -> Tensor:

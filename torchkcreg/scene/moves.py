@@ -98,6 +98,16 @@ class Moves(ParameterBlocks):
         steps[name] = torch.linalg.lstsq(slopes.T, wanted[:, None]).solution[:, 0]
         return torch.cat(list(steps.values()))
 
+    def keep_covariance(self, covariance: Tensor) -> None:
+        """Tells each motion the covariance of its steps, out of that of all parameters (D, D)."""
+        start = 0
+        for name, block in self.items():
+            end = start + block.num_parameters
+            for part in self.parts:
+                if name == f"motion of {part.name}":
+                    part.bound.motion.keep_covariance(covariance[start:end, start:end])
+            start = end
+
     @torch.no_grad()
     def accept(self, parameters: Tensor) -> None:
         """Moves the scene to parameters (D,); common rigid motions go from the deformations into the poses."""

@@ -7,6 +7,7 @@ from .capture import capture_figure
 from .displacement import displacement_figure
 from .errors import error_map_figure, histogram_figure
 from .history import history_figure
+from .load import load_figure
 from .overlay import overlay_figure
 from .reconstruction import reconstruction_figure
 
@@ -16,6 +17,7 @@ __all__ = [
     "error_map_figure",
     "histogram_figure",
     "history_figure",
+    "load_figure",
     "overlay_figure",
     "reconstruction_figure",
 ]
