@@ -10,7 +10,15 @@ import trimesh
 
 from torchkcreg.deformation import FiniteElementDeformation, Level, deformation_from_dict
 from torchkcreg.implant import ImplantPointCloud, find_holes
-from torchkcreg.mechanics import ElasticBody, Hold, LoadPrior, Superelement, holds_of
+from torchkcreg.mechanics import (
+    ElasticBody,
+    ExpectedLoads,
+    Hold,
+    LoadPrior,
+    Superelement,
+    holds_of,
+    shares_of_holds,
+)
 from torchkcreg.mechanics.holds import unit_loads
 from torchkcreg.physics import elastic_constants
 from torchkcreg.plain import plain
@@ -148,3 +156,46 @@ def test_plates_are_held_at_their_holes_and_bars_along_their_length(bar) -> None
     assert len(patches) >= 3 and patches[0].name == "patch 1"
     assert patches[-1].center[2] - patches[0].center[2] > 0.6 * LONG
     assert holds_of(plate, find_holes(mesh)[:2])[0].name == "patch 1"  # too few to hold it
+
+
+def test_holds_are_used_where_heads_are(element) -> None:
+    heads = torch.tensor([[0.0, 3.0, -44.0], [1.0, 3.0, -46.0], [0.0, 3.0, 12.0]]).double()
+    assert shares_of_holds(element, heads, 0.1).tolist() == pytest.approx([1, 0.1, 1, 0.1])
+    assert shares_of_holds(element, heads[:2], 0.1).tolist() == [1, 1, 1, 1]  # one place alone: no balance
+    assert shares_of_holds(element, heads[:0], 0.1).tolist() == [1, 1, 1, 1]
+
+
+def test_a_hold_that_is_not_used_carries_nothing_and_the_rest_bends_as_if_it_were_not_there(bar, element) -> None:
+    expected = ExpectedLoads.of(element, torch.tensor([1.0, 1e-4, 1.0, 1.0]))
+    loads = expected.loads_of(element)
+    softest = torch.linalg.eigh(expected.precision)[1][:, :6]
+    carried = torch.einsum("ab,ahk->bhk", softest, loads)
+    assert float(carried[:, 1].abs().max()) < 1e-3 * float(carried.abs().max())
+    fewer = Superelement.of(bar, STEEL, [HOLDS[0], *HOLDS[2:]])
+    assert (1 / torch.linalg.eigvalsh(expected.precision)[:6].sqrt()).tolist() == pytest.approx(
+        fewer.expected[:6].tolist(), rel=5e-3
+    )
+
+
+def test_where_all_holds_are_alike_amounts_are_independent(element) -> None:
+    expected = ExpectedLoads.of(element)
+    torch.testing.assert_close(expected.precision, torch.diag(element.expected**-2.0), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(expected.spread, torch.eye(len(element.stiff)).double(), rtol=1e-6, atol=1e-6)
+    assert float(expected.followed.abs().max()) < 1e-6 * float(element.expected[-1] ** -1)
+
+
+def test_a_deformation_learns_where_its_screws_are_and_files_know_it(element, bar) -> None:
+    deformation = FiniteElementDeformation(element, unused=0.01)
+    amounts = torch.zeros(1, element.num_amounts, dtype=torch.float64)
+    amounts[0, 3] = 0.1
+    before = float(deformation.prior(amounts))
+    deformation.fixed_at(torch.tensor([[0.0, 2.0, -45.0], [0.0, 2.0, 45.0]]))
+    assert float(deformation.prior(amounts)) > 10 * before
+    again = deformation_from_dict(plain(deformation.to_dict()))
+    torch.testing.assert_close(again.prior(amounts), deformation.prior(amounts), rtol=1e-4, atol=0)
+    motion = deformation.motion(bar, Level(2))
+    motion.accept(torch.eye(12, dtype=torch.float64)[6])  # the softest way
+    assert float(deformation.loads[1:3].abs().max()) < 0.02 * float(deformation.loads.abs().max())
+    motion.keep_covariance(torch.eye(12, dtype=torch.float64) * 1e-4)
+    values = torch.linalg.eigvalsh(deformation.covariance)
+    assert float(values.min()) > 0 and int((values - 1e-4).abs().lt(1e-9).sum()) >= 6

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchkcreg.deformation.model import Deformation, Level, Motion
 from torchkcreg.deformation.rigid_motion import RigidMotion
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics import Superelement
+from torchkcreg.mechanics import ExpectedLoads, Superelement, shares_of_holds
 
 _BEYOND_MM = 25.0
 
@@ -26,11 +26,14 @@ class FiniteElementDeformation(Deformation):
     Args:
         superelement: Of the implant.
         amounts: Of each of its ways to bend, mm; zero when None.
-        load_weight: Loss for an amount that is a standard deviation of the prior.
+        load_weight: Loss for a load that is a standard deviation of the prior.
+        unused: How strong loads are at holds without a screw, against those with one, where screws are known.
+        shares: That of each hold, (H,); one when None.
         covariance: Of the amounts, (A, A), mm^2, where a registration has found it.
 
     Attributes:
         amounts: Parameter (A,), float64.
+        expected: Of the loads.
     """
 
     model = "fe"
@@ -41,10 +44,15 @@ class FiniteElementDeformation(Deformation):
         amounts: Tensor | None = None,
         *,
         load_weight: float = 1e-5,
+        unused: float = 1.0,
+        shares: Tensor | None = None,
         covariance: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.superelement, self.load_weight, self.covariance = superelement, load_weight, covariance
+        self.superelement, self.load_weight, self.unused = superelement, load_weight, unused
+        self.covariance = covariance
+        self.shares = superelement.expected.new_ones(len(superelement.holds)) if shares is None else shares
+        self.expected = ExpectedLoads.of(superelement, self.shares)
         start = torch.zeros_like(superelement.expected) if amounts is None else amounts.detach().clone()
         self.amounts = nn.Parameter(start.to(superelement.expected))
 
@@ -52,6 +60,8 @@ class FiniteElementDeformation(Deformation):
         super()._apply(fn, recurse)
         self.amounts.data = self.amounts.data.double()
         self.superelement = self.superelement.to(self.amounts.device)
+        self.shares = self.shares.to(self.amounts.device)
+        self.expected = ExpectedLoads.of(self.superelement, self.shares)
         if self.covariance is not None:
             self.covariance = self.covariance.to(self.amounts.device)
         return self
@@ -74,6 +84,11 @@ class FiniteElementDeformation(Deformation):
         free = min(wanted - RigidMotion.num_parameters, self.superelement.num_amounts)
         return FiniteElementMotion(self, cloud, free)
 
+    def fixed_at(self, heads: Tensor) -> None:
+        """Holds without a screw carry less from now on, see :func:`torchkcreg.mechanics.shares_of_holds`."""
+        self.shares = shares_of_holds(self.superelement, heads, self.unused)
+        self.expected = ExpectedLoads.of(self.superelement, self.shares)
+
     def outside(self, points: Tensor) -> Tensor:
         """True for points (..., 3) well beyond the implant's ends, where its end sections' motion goes on."""
         sections = self.superelement.sections
@@ -82,12 +97,12 @@ class FiniteElementDeformation(Deformation):
 
     def prior(self, amounts: Tensor) -> Tensor:
         """What speaks against amounts (K, A) but the images, shape (K,): how strong the loads at the holds are."""
-        return self.load_weight * (amounts / self.superelement.expected).square().sum(-1)
+        return self.load_weight * torch.einsum("ka,ab,kb->k", amounts, self.expected.precision, amounts)
 
     @property
     def loads(self) -> Tensor:
         """Force and moment at each hold, (H, 6), N and N mm, in the implant's axes."""
-        return self.superelement.loads_at(self.amounts.detach())
+        return torch.einsum("a,ahk->hk", self.amounts.detach(), self.expected.loads_of(self.superelement))
 
     def to_dict(self) -> dict[str, Any]:
         """Superelement and amounts."""
@@ -99,23 +114,29 @@ class FiniteElementDeformation(Deformation):
             "amounts": amounts,
             "covariance": covariance,
             "load_weight": self.load_weight,
+            "unused": self.unused,
+            "shares": self.shares.cpu(),
             "superelement": content,
         }
 
 
 class FiniteElementMotion(Motion):
-    """Rotation and translation of the whole implant, and steps of the softest ways to bend, all in mm.
+    """Rotation and translation of the whole implant, and steps along the softest ways to bend, all in mm.
+
+    Softest under the loads that are expected.
 
     Args:
         deformation: Where the motion starts.
         cloud: The implant; its middle is what it turns about.
-        num_free: How many amounts may change.
+        num_free: Along how many ways it may bend.
     """
 
     def __init__(self, deformation: FiniteElementDeformation, cloud: ImplantPointCloud, num_free: int) -> None:
         self.deformation, self.num_free = deformation, num_free
         self.start = deformation.amounts.detach().clone()
         self.loss_of_deviation = deformation.load_weight
+        self.precisions, ways = torch.linalg.eigh(deformation.expected.precision)
+        self.all_ways, self.ways = ways, ways[:, :num_free]
         self.whole = RigidMotion(deformation, cloud)
         self.num_parameters = self.whole.num_parameters + num_free
 
@@ -147,13 +168,12 @@ class FiniteElementMotion(Motion):
     def keep_covariance(self, covariance: Tensor) -> None:
         """That of the amounts; those that were not free have what the prior expects."""
         free = self.whole.num_parameters
-        whole = torch.diag(self.deformation.superelement.expected.square())
+        whole = torch.diag(1 / self.precisions)
         whole[: self.num_free, : self.num_free] = covariance[free:, free:].to(whole)
-        self.deformation.covariance = whole
+        self.deformation.covariance = self.all_ways @ whole @ self.all_ways.T
 
     def _amounts(self, steps: Tensor) -> Tensor:
-        moved = self.start[: self.num_free] + steps[:, self.whole.num_parameters :]
-        return torch.cat([moved, self.start[self.num_free :].to(moved).expand(len(steps), -1)], dim=-1)
+        return self.start.to(steps) + steps[:, self.whole.num_parameters :] @ self.ways.T.to(steps)
 
 
 def section_features(superelement: Superelement, points: Tensor) -> Tensor:

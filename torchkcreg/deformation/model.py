@@ -93,6 +93,9 @@ class Deformation(nn.Module, ABC):
             ValueError: If the level is coarser than the deformation so far.
         """
 
+    def fixed_at(self, heads: Tensor) -> None:
+        """Hears, before it moves, where components are fixed to it, heads (C, 3) in its frame; forgets by default."""
+
     def jacobian(self, points: Tensor) -> Tensor:
         """Jacobians (..., N, 3, 3) of x -> x + u(x), [i, j] = d (x + u)_i / d x_j; central differences by default."""
         points, step = points.double(), 1e-3

@@ -40,11 +40,13 @@ def _free_form(content: dict[str, Any]) -> FreeFormDeformation:
 def _finite_elements(content: dict[str, Any]) -> FiniteElementDeformation:
     require_keys(content, ("superelement", "amounts", "load_weight"), " of a deformation")
     superelement = Superelement.from_dict(content["superelement"])
-    number, covariance = superelement.num_amounts, content.get("covariance")
+    number, covariance, shares = superelement.num_amounts, content.get("covariance"), content.get("shares")
     return FiniteElementDeformation(
         superelement,
         finite_array(content["amounts"], (number,), "amounts"),
         load_weight=float(content["load_weight"]),
+        unused=float(content.get("unused", 1.0)),
+        shares=None if shares is None else finite_array(shares, (len(superelement.holds),), "shares"),
         covariance=None if covariance is None else finite_array(covariance, (number, number), "covariance"),
     )
 

@@ -105,7 +105,8 @@ def load_files(
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE_MM)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     points = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
-    stress, std = node_stresses(element, points, amounts, covariance)
+    known = own.expected.covariance if covariance is None else covariance
+    stress, std = node_stresses(element, points, amounts, known)
     worst, limit = int(stress.argmax()), element.constants.yield_stress
     if float(stress[worst]) > limit:
         warnings.append(
@@ -113,7 +114,7 @@ def load_files(
             "implant was bent before or beyond this load; --against a run without load takes that out"
         )
     found = ImplantLoad(
-        CarriedLoad.of(element, amounts, covariance),
+        CarriedLoad.of(element, amounts, covariance, own.expected),
         float(stress[worst]),
         float(std[worst]),
         limit,

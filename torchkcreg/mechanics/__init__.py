@@ -2,6 +2,7 @@
 
 from torchkcreg.mechanics.body import ElasticBody
 from torchkcreg.mechanics.carried import CarriedLoad, node_stresses
+from torchkcreg.mechanics.expected_loads import ExpectedLoads, shares_of_holds
 from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for
 from torchkcreg.mechanics.holds import Hold, holds_of
 from torchkcreg.mechanics.sections import Sections
@@ -12,6 +13,7 @@ from torchkcreg.mechanics.superelement import LoadPrior, Superelement
 __all__ = [
     "CarriedLoad",
     "ElasticBody",
+    "ExpectedLoads",
     "Hexahedra",
     "Hold",
     "LoadPrior",
@@ -20,6 +22,7 @@ __all__ = [
     "edge_for",
     "holds_of",
     "node_stresses",
+    "shares_of_holds",
     "stiffness_matrix",
     "von_mises",
 ]

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchkcreg.mechanics.expected_loads import ExpectedLoads
 from torchkcreg.mechanics.sections import Sections
 from torchkcreg.mechanics.stress import stresses, von_mises
 from torchkcreg.mechanics.superelement import Superelement
@@ -44,19 +45,27 @@ class CarriedLoad:
     section_std: Tensor
 
     @classmethod
-    def of(cls, element: Superelement, amounts: Tensor, covariance: Tensor | None = None) -> CarriedLoad:
+    def of(
+        cls,
+        element: Superelement,
+        amounts: Tensor,
+        covariance: Tensor | None = None,
+        expected: ExpectedLoads | None = None,
+    ) -> CarriedLoad:
         """Of amounts (A,) of an implant's ways to bend.
 
         Args:
             element: The implant.
             amounts: mm.
             covariance: Of them, (A, A), mm^2; without it nothing is known but what the prior expects.
+            expected: Of its loads; that all holds are alike when None.
         """
         axes = _axes(element)
-        covariance = torch.diag(element.expected.square()) if covariance is None else covariance
+        expected = expected or ExpectedLoads.of(element)
+        covariance = expected.covariance if covariance is None else covariance
         places = torch.tensor([hold.center for hold in element.holds], dtype=torch.float64).to(axes)
         turned = torch.block_diag(axes, axes)
-        loads, stiff = element.loads @ turned.mT, element.stiff @ turned.mT
+        loads, stiff = expected.loads_of(element) @ turned.mT, element.stiff @ turned.mT
         low, high = element.sections.heights[0], element.sections.heights[-1]
         heights = torch.linspace(0, 1, _SECTIONS, dtype=torch.float64, device=axes.device) * (high - low)
         through = _through(places @ axes.mT, _middles(element.sections, heights + low) @ axes.mT)
@@ -64,7 +73,8 @@ class CarriedLoad:
         def found(mapping: Tensor) -> tuple[Tensor, Tensor]:
             ways = torch.einsum("tkhl,ahl->tka", mapping, loads)
             rest = torch.einsum("tkhl,bhl->tkb", mapping, stiff)
-            variance = torch.einsum("tka,ab,tkb->tk", ways, covariance, ways) + rest.square().sum(-1)
+            variance = torch.einsum("tka,ab,tkb->tk", ways, covariance, ways)
+            variance = variance + torch.einsum("tka,ab,tkb->tk", rest, expected.spread, rest)
             return ways @ amounts, variance.clamp_min(0).sqrt()
 
         number = len(places)
@@ -87,9 +97,7 @@ class CarriedLoad:
         }
 
 
-def node_stresses(
-    element: Superelement, points: Tensor, amounts: Tensor, covariance: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def node_stresses(element: Superelement, points: Tensor, amounts: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Von Mises stress (P,) at points (P, 3) of the undeformed implant and its standard deviation, N/mm^2.
 
     Args:
@@ -98,13 +106,14 @@ def node_stresses(
         amounts: Of its ways to bend, (A,), mm.
         covariance: Of them, (A, A), mm^2.
     """
-    covariance = torch.diag(element.expected.square()) if covariance is None else covariance
     found, deviations = [], []
     for some in points.double().split(_AT_ONCE):
         ways = stresses(element.hexahedra, element.filled, element.constants, some, element.nodal)
         total = torch.einsum("a,apij->pij", amounts, ways)
         value = von_mises(total)
-        deviator = total - total.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).to(total)
+        deviator = total - total.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(
+            3, dtype=total.dtype, device=total.device
+        )
         slope = torch.einsum("pij,apij->pa", deviator, ways) * (1.5 / value.clamp_min(1e-9))[:, None]
         found.append(value)
         deviations.append(torch.einsum("pa,ab,pb->p", slope, covariance, slope).clamp_min(0).sqrt())

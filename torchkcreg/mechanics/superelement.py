@@ -52,6 +52,7 @@ class Superelement:
         loads: Forces and moments at the holds of each way at an amount of one, (A, H, 6), N and N mm, in the implant's
             axes. An amount of one moves the implant by 1 mm, root mean square.
         expected: Amounts (A,) that the prior expects, standard deviations, mm.
+        prior: How strong those are.
         stiff: Loads (B, H, 6), of one standard deviation, that move the implant less than images can tell.
         nodal: Displacements (A, N, 3) of the hexahedra's nodes at an amount of one, mm.
         shifts: Of the sections, (A, S, 3), mm.
@@ -65,6 +66,7 @@ class Superelement:
     sections: Sections
     loads: Tensor
     expected: Tensor
+    prior: LoadPrior
     stiff: Tensor
     nodal: Tensor
     shifts: Tensor
@@ -118,6 +120,7 @@ class Superelement:
             sections,
             ways.unflatten(-1, (-1, 6)),
             expected,
+            prior,
             stiff.unflatten(-1, (-1, 6)),
             torch.einsum("al,lni->ani", ways, units),
             shifts,
@@ -148,10 +151,6 @@ class Superelement:
         whole = interpolated(self.hexahedra, nodal, cube, held)
         return whole - self.sections.blended(there, shifts, turns)
 
-    def loads_at(self, amounts: Tensor) -> Tensor:
-        """Forces and moments (..., H, 6) at the holds, N and N mm, of amounts (..., A)."""
-        return torch.einsum("...a,ahk->...hk", amounts, self.loads)
-
     def stress(self, points: Tensor, amounts: Tensor) -> Tensor:
         """Stresses (P, 3, 3) at points (P, 3) of the undeformed implant, N/mm^2, in its axes."""
         nodal = torch.einsum("a,ani->ni", amounts.to(self.nodal), self.nodal)[None]
@@ -168,6 +167,7 @@ class Superelement:
         return {
             "hexahedra": {"frame": cubes.frame, "edge": cubes.edge, "cells": cubes.cells},
             "constants": asdict(self.constants),
+            "prior": asdict(self.prior),
             "holds": [asdict(hold) for hold in self.holds],
             "sections": {"axis": sections.axis, "heights": sections.heights, "centers": sections.centers},
             **{name: getattr(self, name) for name in _NUMBERS},
@@ -181,13 +181,14 @@ class Superelement:
         Raises:
             ValueError: A key is missing or malformed; the message names it.
         """
-        parts = ("hexahedra", "constants", "holds", "sections")
+        parts = ("hexahedra", "constants", "prior", "holds", "sections")
         require_keys(content, (*parts, *_NUMBERS, "nodal"), " of a superelement")
         try:
             cubes = content["hexahedra"]
             return cls(
                 Hexahedra.of_cells(_numbers(cubes["frame"]), float(cubes["edge"]), _numbers(cubes["cells"]).long()),
                 constants=ElasticConstants(**content["constants"]),
+                prior=LoadPrior(**content["prior"]),
                 holds=tuple(Hold(**_with_tuples(hold)) for hold in content["holds"]),
                 sections=Sections(**{name: _numbers(value) for name, value in content["sections"].items()}),
                 nodal=_numbers(content["nodal"]),

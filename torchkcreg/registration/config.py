@@ -165,6 +165,7 @@ class RegistrationConfig(Config):
         load_weight: Loss for a load of 1 kN along an elastic mode, in stages of modes; it grows with the load's square.
         hold_force_n: Force along each axis that is expected at a hole, standard deviation, N; of finite elements.
         hold_moment_nmm: Moment about each axis there, N mm.
+        hold_unused: How strong they are at holes without a screw against those with one, where screws are known.
         hold_weight: Loss for a load that is a standard deviation; it grows with the load's square.
         prior_weight: Loss for a parameter of the intensity model that is a standard deviation off where it most likely
             is; it grows with the square.
@@ -195,6 +196,7 @@ class RegistrationConfig(Config):
     load_weight: float = Field(3e-9, ge=0)
     hold_force_n: float = Field(300.0, gt=0)
     hold_moment_nmm: float = Field(5000.0, gt=0)
+    hold_unused: float = Field(0.05, gt=0, le=1)
     hold_weight: float = Field(1e-5, ge=0)
     prior_weight: float = Field(5e-4, ge=0)
     youngs_modulus_gpa: float = Field(200.0, gt=0)

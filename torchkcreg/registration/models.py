@@ -28,7 +28,7 @@ class Implant:
         implant_to_world: Approximate pose (4, 4); the identity when None.
         material: Name of its material; that of the options when None.
         name: How results refer to it.
-        holds: Where finite elements are loaded, in place of the holes.
+        holds: Where finite elements are loaded, in place of the holes, with screws or without.
     """
 
     cloud: ImplantPointCloud
@@ -67,4 +67,5 @@ def finite_elements(implant: Implant, config: RegistrationConfig) -> FiniteEleme
         implant.holds or holds_of(cloud, implant.holes),
         prior=LoadPrior(config.hold_force_n, config.hold_moment_nmm),
     )
-    return FiniteElementDeformation(superelement, load_weight=config.hold_weight)
+    unused = 1.0 if implant.holds else config.hold_unused
+    return FiniteElementDeformation(superelement, load_weight=config.hold_weight, unused=unused)

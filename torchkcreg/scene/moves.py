@@ -122,6 +122,7 @@ class _Part:
 
     def __init__(self, assembly: Assembly, view: View, nodes: Tensor, level: Level) -> None:
         self.assembly, self.name = assembly, assembly.name
+        assembly.deformation.fixed_at(assembly.heads)
         self.bound = BoundMotion(assembly, assembly.deformation.motion(assembly.implant, level), nodes)
         self.shapes: ScrewShapes | None = None
         self.tilts: ComponentTilts | None = None
