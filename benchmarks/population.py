@@ -2,6 +2,7 @@
 
     python benchmarks/population.py                      # 40 cases, three neighbouring views, about 20 minutes
     python benchmarks/population.py --views around --known
+    python benchmarks/population.py --elastic --known --options '{"deformation": "fe"}'  # loads are known, too
 
 Rows are written as they come; a run that was broken off goes on where it stopped. The cases are those of
 `torchkcreg.simulation.random_case`; two are registered at a time, with a thread each.
@@ -32,15 +33,18 @@ import torch  # noqa: E402
 from matplotlib.ticker import NullFormatter  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
+from torchkcreg.deformation import Deformation, FiniteElementDeformation  # noqa: E402
 from torchkcreg.evaluation import bb_rmse  # noqa: E402
 from torchkcreg.experiments.capture import registration_inputs  # noqa: E402
 from torchkcreg.implant import find_holes  # noqa: E402
+from torchkcreg.mechanics import CarriedLoad  # noqa: E402
 from torchkcreg.physics import line_integrals_from_intensity  # noqa: E402
 from torchkcreg.registration import Callback, RegistrationConfig, RegistrationData, Trainer, build_scene  # noqa: E402
 from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case  # noqa: E402
 
 WRONG_MM, RIGHT_MM = 0.15, 0.10
-Job = tuple[int, str, bool, dict[str, Any], str, str]
+_MOMENTS = ("moment", "moment_found", "moment_std")
+Job = tuple[int, str, bool, bool, dict[str, Any], str, str]
 
 
 class _ErrorsOfStages(Callback):
@@ -109,15 +113,46 @@ def register_case(
         "kind": f"{draw.material} {draw.screw_material} {draw.scanner} {draw.kvp} kV water {draw.water_radius:.0f}",
         "physics": " ".join(f"{name}={value:.3f}" for name, value in result.intensity.items()),
         "stages": " ".join(trace.errors),
+        **load_errors(case, result.deformation),
     }
 
 
+def load_errors(case: SimulatedCase, deformation: Deformation) -> dict[str, Any]:
+    """Bending moment in N mm where the plate carries the largest one: the true one, what was found, its deviation."""
+    if case.carried is None or not isinstance(deformation, FiniteElementDeformation):
+        return {}
+    true = case.carried.section_loads[:, 3:5]
+    at, axis = divmod(int(true.abs().argmax()), 2)
+    found = CarriedLoad.of(
+        deformation.superelement, deformation.amounts.detach(), deformation.covariance, deformation.expected
+    )
+    turned = (found.axes @ case.carried.axes.mT)[axis, axis].sign()  # a lattice's axes may point the other way
+    return {
+        "moment": round(float(true[at, axis])),
+        "moment_found": round(float(turned * found.section_loads[at, 3 + axis])),
+        "moment_std": round(float(found.section_std[at, 3 + axis])),
+    }
+
+
+def load_summary(rows: list[dict[str, Any]]) -> str:
+    """How well bending moments are found, and how often their intervals hold them."""
+    true, found, std = (np.array([row[name] for row in rows], dtype=float) for name in _MOMENTS)
+    error = np.abs(found - true)
+    within = error <= np.maximum(0.05 * np.abs(true), 50.0)
+    return (
+        f"bending moments of {len(rows)}: error median {np.median(error):.0f} N mm, "
+        f"{np.median(error / np.abs(true)):.1%} of them; "
+        f"{within.sum()} within 5 % or 50 N mm; {np.mean(error <= std):.0%} within one standard deviation, "
+        f"{np.mean(error <= 2 * std):.0%} within two"
+    )
+
+
 def _job(job: Job) -> dict[str, Any]:
-    seed, views, known, options, images, cache = job
+    seed, views, elastic, known, options, images, cache = job
     torch.set_num_threads(1)
     draw = draw_case(seed)
-    kept = Path(cache) / f"{views}-{seed}.npy" if cache else None
-    case = random_case(draw, views=views, counts=_load(kept))
+    kept = Path(cache) / f"{'elastic-' if elastic else ''}{views}-{seed}.npy" if cache else None
+    case = random_case(draw, views=views, elastic=elastic, counts=_load(kept))
     if kept is not None and not kept.exists():
         kept.parent.mkdir(parents=True, exist_ok=True)
         np.save(kept, case.intensity.numpy())
@@ -214,7 +249,8 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--seeds", type=lambda text: [int(s) for s in text.split(",")], help="these seeds alone")
-    parser.add_argument("--views", choices=("neighbours", "around", "both"), default="neighbours")
+    parser.add_argument("--views", choices=("neighbours", "around", "both", "spread"), default="neighbours")
+    parser.add_argument("--elastic", action="store_true", help="plates bend under loads that are known")
     parser.add_argument("--known", action="store_true", help="screws and spectrum are told")
     parser.add_argument(
         "--images", choices=("own", "other", "mirrored", "turned"), default="own", help="else: wrong ones"
@@ -225,9 +261,11 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     name = f"population-{options.views}-{'known' if options.known else 'plain'}"
+    name += "-elastic" if options.elastic else ""
     name += "" if options.images == "own" else f"-{options.images}"
     seeds = options.seeds or range(options.first, options.first + options.cases)
-    jobs = [(seed, options.views, options.known, options.options, options.images, options.cache) for seed in seeds]
+    same = (options.views, options.elastic, options.known, options.options, options.images, options.cache)
+    jobs = [(seed, *same) for seed in seeds]
     rows = sorted(rows_of(options.out / f"{name}.jsonl", jobs), key=lambda row: row["seed"])
     with (options.out / f"{name}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, max(rows, key=len), extrasaction="ignore")
@@ -237,6 +275,8 @@ def main() -> None:
         draw_plot(rows, options.out / f"{name}.png")
         draw_verdict([row for row in rows if "node_std_mm" in row], options.out / f"{name}-verdict.png")
     print(summary(rows))
+    if loads := [row for row in rows if "moment" in row]:
+        print(load_summary(loads))
 
 
 if __name__ == "__main__":

@@ -22,6 +22,12 @@ class ParameterBlock:
     num_parameters: int
     loss_of_deviation: float = 0.0
 
+    def weigh(self, loss: float) -> None:
+        """Hears what a standard deviation of the images is worth in loss, for priors that have no weight of their own.
+
+        Forgets it by default.
+        """
+
     def clamp(self, steps: Tensor) -> Tensor:
         """Steps (K, D) within their bounds; as they are by default."""
         return steps

@@ -27,6 +27,7 @@ class FiniteElementDeformation(Deformation):
         superelement: Of the implant.
         amounts: Of each of its ways to bend, mm; zero when None.
         load_weight: Loss for a load that is a standard deviation of the prior.
+        weighed: A registration finds that weight, by what its images disagree about.
         unused: How strong loads are at holds without a screw, against those with one, where screws are known.
         shares: That of each hold, (H,); one when None.
         covariance: Of the amounts, (A, A), mm^2, where a registration has found it.
@@ -43,14 +44,17 @@ class FiniteElementDeformation(Deformation):
         superelement: Superelement,
         amounts: Tensor | None = None,
         *,
-        load_weight: float = 1e-5,
+        load_weight: float = 1e-6,
+        weighed: bool = False,
         unused: float = 1.0,
         shares: Tensor | None = None,
         covariance: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.superelement, self.load_weight, self.unused = superelement, load_weight, unused
-        self.covariance = covariance
+        self.superelement, self.unused, self.covariance = superelement, unused, covariance
+        self.weighed = weighed
+        weight = torch.tensor(load_weight, dtype=torch.float64, device=superelement.expected.device)
+        self.register_buffer("weight", weight)  # part of the state: a checkpoint keeps what was found
         self.shares = superelement.expected.new_ones(len(superelement.holds)) if shares is None else shares
         self.expected = ExpectedLoads.of(superelement, self.shares)
         start = torch.zeros_like(superelement.expected) if amounts is None else amounts.detach().clone()
@@ -58,13 +62,18 @@ class FiniteElementDeformation(Deformation):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> FiniteElementDeformation:
         super()._apply(fn, recurse)
-        self.amounts.data = self.amounts.data.double()
+        self.amounts.data, self.weight = self.amounts.data.double(), self.weight.double()
         self.superelement = self.superelement.to(self.amounts.device)
         self.shares = self.shares.to(self.amounts.device)
         self.expected = ExpectedLoads.of(self.superelement, self.shares)
         if self.covariance is not None:
             self.covariance = self.covariance.to(self.amounts.device)
         return self
+
+    @property
+    def load_weight(self) -> float:
+        """Loss for a load that is a standard deviation of the prior."""
+        return float(self.weight)
 
     def displacement(self, points: Tensor) -> Tensor:
         """Displacements u, mm, of points (..., N, 3) in the implant's frame."""
@@ -97,7 +106,7 @@ class FiniteElementDeformation(Deformation):
 
     def prior(self, amounts: Tensor) -> Tensor:
         """What speaks against amounts (K, A) but the images, shape (K,): how strong the loads at the holds are."""
-        return self.load_weight * torch.einsum("ka,ab,kb->k", amounts, self.expected.precision, amounts)
+        return self.weight * torch.einsum("ka,ab,kb->k", amounts, self.expected.precision, amounts)
 
     @property
     def loads(self) -> Tensor:
@@ -134,11 +143,20 @@ class FiniteElementMotion(Motion):
     def __init__(self, deformation: FiniteElementDeformation, cloud: ImplantPointCloud, num_free: int) -> None:
         self.deformation, self.num_free = deformation, num_free
         self.start = deformation.amounts.detach().clone()
-        self.loss_of_deviation = deformation.load_weight
         self.precisions, ways = torch.linalg.eigh(deformation.expected.precision)
         self.all_ways, self.ways = ways, ways[:, :num_free]
         self.whole = RigidMotion(deformation, cloud)
         self.num_parameters = self.whole.num_parameters + num_free
+
+    @property
+    def loss_of_deviation(self) -> float:  # type: ignore[override]
+        """The prior's weight."""
+        return self.deformation.load_weight
+
+    def weigh(self, loss: float) -> None:
+        """The prior counts as it should, if its weight is to be found."""
+        if self.deformation.weighed:
+            self.deformation.weight.fill_(loss)
 
     def features(self, points: Tensor) -> Tensor:
         """Those of the sections (4 S), then each way's remainder (3 A)."""

@@ -111,6 +111,7 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
     parts, every = ("screws", "tilts"), ("screws", "tilts", *PHYSICS)
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
     fine = {"estimate": every, "before": ("background", "reweight"), **seen}
+    weighed = {"before": (*fine["before"], "weigh")} if deformation == "fe" else {}
     hardness = ("scatter", "removed", "hardness")  # coarse pixels do not tell blur
     levels = [
         Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts),
@@ -118,7 +119,7 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
         Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen),
         Stage(groups=2, bin=2, **fine),
         Stage(**finest, bin=2, **fine),
-        Stage(**finest, bin=1, **fine),
+        Stage(**finest, bin=1, **{**fine, **weighed}),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
@@ -166,7 +167,8 @@ class RegistrationConfig(Config):
         hold_force_n: Force along each axis that is expected at a hole, standard deviation, N; of finite elements.
         hold_moment_nmm: Moment about each axis there, N mm.
         hold_unused: How strong they are at holes without a screw against those with one, where screws are known.
-        hold_weight: Loss for a load that is a standard deviation; it grows with the load's square.
+        hold_weight: Loss for a load that is a standard deviation; it grows with the load's square. None: what one of
+            the images is worth, found in stages with the step "weigh".
         prior_weight: Loss for a parameter of the intensity model that is a standard deviation off where it most likely
             is; it grows with the square.
         youngs_modulus_gpa: Young's modulus of the implant, GPa. The default is that of steel; only its square times
@@ -197,7 +199,7 @@ class RegistrationConfig(Config):
     hold_force_n: float = Field(300.0, gt=0)
     hold_moment_nmm: float = Field(5000.0, gt=0)
     hold_unused: float = Field(0.05, gt=0, le=1)
-    hold_weight: float = Field(1e-5, ge=0)
+    hold_weight: float | None = Field(None, ge=0)
     prior_weight: float = Field(5e-4, ge=0)
     youngs_modulus_gpa: float = Field(200.0, gt=0)
     scatter: float = Field(0.08, ge=0, lt=1)

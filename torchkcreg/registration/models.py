@@ -68,4 +68,6 @@ def finite_elements(implant: Implant, config: RegistrationConfig) -> FiniteEleme
         prior=LoadPrior(config.hold_force_n, config.hold_moment_nmm),
     )
     unused = 1.0 if implant.holds else config.hold_unused
+    if config.hold_weight is None:
+        return FiniteElementDeformation(superelement, weighed=True, unused=unused)
     return FiniteElementDeformation(superelement, load_weight=config.hold_weight, unused=unused)

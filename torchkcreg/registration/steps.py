@@ -15,6 +15,7 @@ from .basins import places
 from .config import Stage
 from .screws import find_screws, of_best_metal, screws_by_metal
 from .stage_run import StageRun, Step
+from .uncertainty import loss_of_a_deviation
 from .verdict import Rival
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
@@ -62,6 +63,14 @@ def reweight(run: StageRun) -> None:
     run.objective = run.objective.reweighted()
 
 
+def weigh(run: StageRun) -> None:
+    """Tells priors without a weight of their own how much the images are worth, see `loss_of_a_deviation`."""
+    objective = run.objective
+    loss = loss_of_a_deviation(objective, objective.at_rest[0])
+    for block in objective.moves.values():
+        block.weigh(loss)
+
+
 def slide(run: StageRun) -> None:
     """Tries the implants all along their long axes, and stays where the rigid stages explain the images best."""
     candidates = places(run.objective, run.begin().best())
@@ -102,6 +111,7 @@ BEFORE: dict[str, Step] = {
     "choose_screws": choose,
     "background": estimate_background,
     "reweight": reweight,
+    "weigh": weigh,
 }
 AFTER: dict[str, Step] = {"slide": slide}
 CHANGE_SCENE = _LOOKS  # of the steps before an optimiser: a checkpoint within a stage has what they did

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid
 from torchkcreg.implant import Screw
+from torchkcreg.mechanics import CarriedLoad
 from torchkcreg.physics import Spectrum, tungsten_spectrum
 from torchkcreg.simulation.hardware import hole_positions, locking_plate, locking_screws
 from torchkcreg.simulation.loads import Load
@@ -46,6 +47,7 @@ class SimulatedCase:
         spectrum: The detected spectrum.
         load: What was done to the plate.
         parts: What stood in the beam.
+        carried: What the plate carries, where that is known.
     """
 
     geometry: ConeBeamGeometry
@@ -61,6 +63,7 @@ class SimulatedCase:
     spectrum: Spectrum
     load: Load
     parts: list[Part]
+    carried: CarriedLoad | None = None
 
     def deformed_implant(self) -> trimesh.Trimesh:
         """Mesh of the plate under load: the truth."""

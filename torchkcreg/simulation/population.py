@@ -17,27 +17,36 @@ from torchkcreg.implant import Screw
 from torchkcreg.physics import tungsten_spectrum
 from torchkcreg.simulation.cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase, fragment_at
 from torchkcreg.simulation.draws import Draw, draw_case
+from torchkcreg.simulation.elastic import ElasticMotion, elastic_motion
 from torchkcreg.simulation.hardware import locking_plate
 from torchkcreg.simulation.loads import Load, RodMotion
 from torchkcreg.simulation.parts import Part
 from torchkcreg.simulation.scanner import simulate_projections
 from torchkcreg.simulation.solids import Cylinder, Sphere, Tube
 
-ViewSet = Literal["neighbours", "around", "both"]
+PlateMotion = RodMotion | ElasticMotion
+ViewSet = Literal["neighbours", "around", "both", "spread"]
 _SOFTENING_MM = 4.0  # over which a plate's curvature sets in beside a screw that holds it
 
 
-def random_case(seed: int | Draw, *, views: ViewSet = "neighbours", counts: Tensor | None = None) -> SimulatedCase:
+def random_case(
+    seed: int | Draw, *, views: ViewSet = "neighbours", elastic: bool = False, counts: Tensor | None = None
+) -> SimulatedCase:
     """A case of the population: its images and the truth about it.
 
     Args:
         seed: Names the case; or what was drawn, changed as you like.
-        views: Three neighbouring views, a focal spot each; six around the limb; or both, in this order.
+        views: Three neighbouring views, a focal spot each; six around the limb; or both, in this order. "spread": three
+            around the limb.
+        elastic: The plate bends as its finite elements do under loads at its screws, which are known then; else as a
+            rod with a drawn curvature.
         counts: The images, where they have been kept: making them takes seconds.
     """
     draw = seed if isinstance(seed, Draw) else draw_case(seed)
     rest, loaded = motions(draw)
-    straight = _straight_plate(draw)
+    straight, carried = _straight_plate(draw), None
+    if elastic:
+        loaded, carried = elastic_motion(draw, rest, _mapped(straight, rest))
 
     def deform(points: Tensor) -> Tensor:
         return loaded(rest.straightened(points)).to(points.dtype)
@@ -68,6 +77,7 @@ def random_case(seed: int | Draw, *, views: ViewSet = "neighbours", counts: Tens
         spectrum=spectrum,
         load=Load(bend_deg=draw.bend_deg, s_bend_deg=draw.s_bend_deg, torsion_deg=draw.torsion_deg),
         parts=parts,
+        carried=carried,
     )
 
 
@@ -78,8 +88,9 @@ def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
     if draw.scanner == "c-arm":
         spots = {"T1": 40.0, "T2": 0.0, "T3": -40.0}
         scanner = replace(scanner, sad=620.0, sdd=1050.0)
-    near = [draw.azimuth_deg + step for step in range(3)] if views != "around" else []
-    around = [draw.azimuth_deg + 30.0 * step + 10.0 for step in range(6)] if views != "neighbours" else []
+    near = [draw.azimuth_deg + step for step in range(3)] if views in ("neighbours", "both") else []
+    around = [draw.azimuth_deg + 30.0 * step + 10.0 for step in range(6)] if views in ("around", "both") else []
+    around += [draw.azimuth_deg + 60.0 * step for step in range(3)] if views == "spread" else []
     angles = [*near, *around]
     names = [f"T{1 + index % 3}" for index in range(len(angles))]
     whole = [
@@ -99,7 +110,7 @@ def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
     return joined.crop(slice(32, scanner.det_shape[0] - 32), slice(left, left + cols))
 
 
-def motions(draw: Draw) -> tuple[RodMotion, RodMotion]:
+def motions(draw: Draw) -> tuple[RodMotion, PlateMotion]:
     """From the straight plate to the undeformed one, and to the loaded one."""
     half = draw.length / 2
     bow = torch.deg2rad(torch.tensor([draw.bow_deg, 0.0, draw.twist_deg], dtype=torch.float64)) / draw.length
@@ -139,7 +150,7 @@ def _straight_plate(draw: Draw) -> trimesh.Trimesh:
     return plate
 
 
-def _screws(draw: Draw, rest: RodMotion, loaded: RodMotion) -> tuple[list[Screw], list[Part]]:
+def _screws(draw: Draw, rest: RodMotion, loaded: PlateMotion) -> tuple[list[Screw], list[Part]]:
     """Screws as a list of them says, at rest, and as they stand in the beam, with heads that no list knows."""
     rng = np.random.default_rng([draw.seed, 21])
     listed: list[Screw] = []
@@ -171,7 +182,7 @@ def _screws(draw: Draw, rest: RodMotion, loaded: RodMotion) -> tuple[list[Screw]
     return listed, parts
 
 
-def _limb(draw: Draw, loaded: RodMotion) -> list[Part]:
+def _limb(draw: Draw, loaded: PlateMotion) -> list[Part]:
     """The bone's two fragments, each where its screws take it, and the water around them."""
     depth = -(draw.thickness / 2 + 1.5 + draw.bone_radius)
     parts, tissue = [], _tissue(draw)

@@ -1,0 +1,132 @@
+"""A plate as an elastic body on the screws of two rigid fragments: how it moves, and the load that it carries."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from torchkcreg.deformation import FiniteElementDeformation
+from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
+from torchkcreg.implant import ImplantPointCloud, find_holes
+from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
+from torchkcreg.physics import elastic_constants
+from torchkcreg.simulation.draws import Draw
+from torchkcreg.simulation.loads import RodMotion
+
+_PITCH_MM = 0.3
+_SCREW_SHEAR = 2e3  # N/mm, of a screw in its bone, by which its hold yields
+_SCREW_TURN = 1e5  # N mm/rad
+_SHARES = (0.2, 0.8)  # of the yield stress, that the plate's highest stresses have
+_HIGHEST = 0.98  # quantile that they are
+
+
+class ElasticMotion:
+    """Motion of any point of a straight plate's frame, float64 inside.
+
+    Args:
+        rest: From the straight plate to the undeformed one.
+        deformation: Of the undeformed plate.
+        pose: Rigid motion (4, 4) of it afterwards.
+    """
+
+    def __init__(self, rest: RodMotion, deformation: FiniteElementDeformation, pose: Tensor) -> None:
+        self.rest, self.deformation, self.pose = rest, deformation, pose
+
+    @torch.no_grad()
+    def __call__(self, points: Tensor) -> Tensor:
+        """Moved points, of the shape and dtype of the points (..., 3) in mm."""
+        rested = self.rest(points.double())
+        moved = rested + self.deformation.displacement(rested)
+        return transform_points(self.pose, moved.reshape(-1, 3)).reshape(points.shape).to(points)
+
+    def frames(self, z: Tensor) -> Tensor:
+        """Frames (n, 4, 4) of the plate about heights z (n,): where (x, y, 0) of the section there goes."""
+        around = torch.cartesian_prod(*(torch.linspace(-x, x, n).double() for x, n in zip((4.0, 1.2, 3.0), (5, 3, 5))))
+        lifted = around + z.double()[:, None, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        return torch.stack([fit_rigid(around, moved) for moved in self(lifted)])
+
+
+def elastic_motion(draw: Draw, rest: RodMotion, plate: trimesh.Trimesh) -> tuple[ElasticMotion, CarriedLoad]:
+    """How a drawn plate moves on its screws, and what it carries.
+
+    Each fragment is rigid and the one above turns against the one below by the drawn angles, about the plate's middle
+    between them; screws that hold yield in their bone by springs. The load is scaled so that the plate's highest
+    stresses are a drawn share of the yield stress.
+
+    Args:
+        draw: What was drawn.
+        rest: From the straight plate to the undeformed one.
+        plate: The undeformed one.
+    """
+    rng = np.random.default_rng([draw.seed, 22])
+    cloud = ImplantPointCloud.from_mesh(plate, _PITCH_MM)
+    holds = holds_of(cloud, find_holes(plate))
+    element = Superelement.of(cloud, elastic_constants(draw.material), holds, negligible_mm=0.0)
+    amounts = _amounts(draw, rest, element, rng)
+    stress = von_mises(element.stress(torch.from_numpy(np.array(plate.vertices)), amounts))
+    share = rng.uniform(*_SHARES) * element.constants.yield_stress
+    amounts = amounts * share / float(stress.quantile(_HIGHEST))
+    deformation = FiniteElementDeformation(element, amounts)
+    nodes = cloud.coarsened(6).points.double()
+    turn = torch.deg2rad(torch.tensor(draw.turn_deg, dtype=torch.float64))
+    misaligned = rigid_matrix(turn, torch.tensor(draw.shift, dtype=torch.float64))
+    with torch.no_grad():
+        common = fit_rigid(nodes, deformation(nodes))
+    motion = ElasticMotion(rest, deformation, misaligned @ torch.linalg.inv(common))
+    return motion, CarriedLoad.of(element, amounts)
+
+
+def _amounts(draw: Draw, rest: RodMotion, element: Superelement, rng: np.random.Generator) -> Tensor:
+    """Amounts (A,) for which used holds move as fragments and springs have it, and the others carry nothing."""
+    centers = torch.tensor([hold.center for hold in element.holds], dtype=torch.float64)
+    heights = [draw.hole_heights[hole] for index, hole in enumerate(draw.holes_used) if index != draw.loose]
+    middles = rest(torch.tensor([[0.0, 0.0, z] for z in heights], dtype=torch.float64))
+    used = torch.cdist(middles, centers).argmin(1).tolist()
+    above = torch.tensor([z > 0 for z in heights], dtype=torch.float64)
+    angles = torch.tensor([draw.bend_deg, draw.lateral_deg, draw.torsion_deg], dtype=torch.float64)
+    arm = min(z for z in heights if z > 0) - max(z for z in heights if z < 0)
+    offset = torch.tensor([0.0, math.radians(draw.s_bend_deg) * arm / 4, 0.0], dtype=torch.float64)
+    turn = torch.deg2rad(angles).expand(len(used), 3)
+    wanted = torch.cat([torch.linalg.cross(turn, centers[used]) + offset, turn], dim=1) * above[:, None]
+    springs = rng.lognormal(0.0, 0.5, size=(len(used), 1)) * np.array([_SCREW_SHEAR] * 3 + [_SCREW_TURN] * 3)
+    moved = _hold_motions(element, used)  # (A, U, 6)
+    loads = element.loads
+    rigid = torch.stack([_rigid(centers[hold]) for hold in used])  # (U, 6, 6)
+    free = [hold for hold in range(len(centers)) if hold not in used]
+    number = len(loads)
+    yielding = moved + loads[:, used] / torch.from_numpy(springs)
+    rows = [
+        torch.cat([yielding.flatten(1).T, rigid.flatten(0, 1)], dim=1),
+        torch.cat([loads[:, free].flatten(1).T, loads.new_zeros(6 * len(free), 6)], dim=1) * 1e-4,  # none there
+    ]
+    right = torch.cat([wanted.flatten(), loads.new_zeros(6 * len(free))])
+    return torch.linalg.lstsq(torch.cat(rows), right[:, None], driver="gelsd").solution[:number, 0]
+
+
+def _hold_motions(element: Superelement, holds: list[int]) -> Tensor:
+    """Shift and small turn (A, U, 6) of holds at an amount of one."""
+    positions = transform_points(element.hexahedra.frame, element.hexahedra.positions)
+    found = []
+    for hold in holds:
+        near = element.holds[hold].nodes(positions)
+        arms = positions[near] - positions.new_tensor(element.holds[hold].center)
+        fields = torch.stack([_rigid_rows(arms, column) for column in range(6)])  # (6, P, 3)
+        solution = torch.linalg.lstsq(fields.flatten(1).T, element.nodal[:, near].flatten(1).T.to(fields)).solution
+        found.append(solution.T)
+    return torch.stack(found, dim=1)
+
+
+def _rigid_rows(arms: Tensor, column: int) -> Tensor:
+    axis = torch.eye(3, dtype=arms.dtype)[column % 3].expand_as(arms)
+    return axis if column < 3 else torch.linalg.cross(axis, arms)
+
+
+def _rigid(center: Tensor) -> Tensor:
+    """Shift and turn (6, 6) at a place of the six rigid motions about the origin."""
+    same = torch.eye(3, dtype=center.dtype)
+    turning = torch.linalg.cross(same, center.expand(3, 3)).T
+    return torch.cat([torch.cat([same, turning], dim=1), torch.cat([torch.zeros_like(same), same], dim=1)])
