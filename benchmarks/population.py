@@ -43,7 +43,7 @@ from torchkcreg.registration import Callback, RegistrationConfig, RegistrationDa
 from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case  # noqa: E402
 
 WRONG_MM, RIGHT_MM = 0.15, 0.10
-_MOMENTS = ("moment", "moment_found", "moment_std")
+_MOMENTS = ("true", "found", "std")
 Job = tuple[int, str, bool, bool, dict[str, Any], str, str]
 
 
@@ -118,29 +118,38 @@ def register_case(
 
 
 def load_errors(case: SimulatedCase, deformation: Deformation) -> dict[str, Any]:
-    """Bending moment in N mm where the plate carries the largest one: the true one, what was found, its deviation."""
-    if case.carried is None or not isinstance(deformation, FiniteElementDeformation):
+    """Bending moments in N mm: the true one, what was found, its deviation.
+
+    In the middle between the fragments and where it is largest, each in the direction in which the plate is bent more.
+    """
+    carried = case.carried
+    if carried is None or not isinstance(deformation, FiniteElementDeformation):
         return {}
-    true = case.carried.section_loads[:, 3:5]
-    at, axis = divmod(int(true.abs().argmax()), 2)
     found = CarriedLoad.of(
         deformation.superelement, deformation.amounts.detach(), deformation.covariance, deformation.expected
     )
-    turned = (found.axes @ case.carried.axes.mT)[axis, axis].sign()  # a lattice's axes may point the other way
-    return {
-        "moment": round(float(true[at, axis])),
-        "moment_found": round(float(turned * found.section_loads[at, 3 + axis])),
-        "moment_std": round(float(found.section_std[at, 3 + axis])),
-    }
+    signs = (found.axes @ carried.axes.mT).diagonal().sign()[:2]  # a lattice's axes may point the other way
+    true, moments, std = carried.section_loads[:, 3:5], signs * found.section_loads[:, 3:5], found.section_std[:, 3:5]
+    size = carried.hold_loads.abs().amax(0)
+    used = carried.hold_heights[(carried.hold_loads.abs() > 1e-3 * size).any(1)]
+    middle = carried.heights[-1] / 2
+    gap = (used[used < middle].max() + used[used > middle].min()) / 2
+    places = {"gap": int((carried.heights - gap).abs().argmin()), "largest": int(true.abs().amax(1).argmax())}
+    rows = {}
+    for name, at in places.items():
+        axis = int(true[at].abs().argmax())
+        values = (float(x[at, axis]) for x in (true, moments, std))
+        rows |= {f"{name}_{key}": round(value) for key, value in zip(_MOMENTS, values, strict=True)}
+    return rows
 
 
-def load_summary(rows: list[dict[str, Any]]) -> str:
-    """How well bending moments are found, and how often their intervals hold them."""
-    true, found, std = (np.array([row[name] for row in rows], dtype=float) for name in _MOMENTS)
+def load_summary(rows: list[dict[str, Any]], place: str) -> str:
+    """How well bending moments are found at a place, and how often their intervals hold them."""
+    true, found, std = (np.array([row[f"{place}_{name}"] for row in rows], dtype=float) for name in _MOMENTS)
     error = np.abs(found - true)
     within = error <= np.maximum(0.05 * np.abs(true), 50.0)
     return (
-        f"bending moments of {len(rows)}: error median {np.median(error):.0f} N mm, "
+        f"bending moments, {place}, of {len(rows)}: error median {np.median(error):.0f} N mm, "
         f"{np.median(error / np.abs(true)):.1%} of them; "
         f"{within.sum()} within 5 % or 50 N mm; {np.mean(error <= std):.0%} within one standard deviation, "
         f"{np.mean(error <= 2 * std):.0%} within two"
@@ -275,8 +284,8 @@ def main() -> None:
         draw_plot(rows, options.out / f"{name}.png")
         draw_verdict([row for row in rows if "node_std_mm" in row], options.out / f"{name}-verdict.png")
     print(summary(rows))
-    if loads := [row for row in rows if "moment" in row]:
-        print(load_summary(loads))
+    if loads := [row for row in rows if "gap_true" in row]:
+        print(*(load_summary(loads, place) for place in ("gap", "largest")), sep="\n")
 
 
 if __name__ == "__main__":

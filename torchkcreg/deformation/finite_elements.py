@@ -38,6 +38,7 @@ class FiniteElementDeformation(Deformation):
     """
 
     model = "fe"
+    weight: Tensor
 
     def __init__(
         self,

@@ -110,16 +110,17 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
     )
     parts, every = ("screws", "tilts"), ("screws", "tilts", *PHYSICS)
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
-    fine = {"estimate": every, "before": ("background", "reweight"), **seen}
-    weighed = {"before": (*fine["before"], "weigh")} if deformation == "fe" else {}
+    fine = {"estimate": every, **seen}
+    after_others = ("background", "reweight")
+    weighed = ("weigh",) if deformation == "fe" else ()
     hardness = ("scatter", "removed", "hardness")  # coarse pixels do not tell blur
     levels = [
         Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts),
         Stage(bin=4, before=("find_screws", "background"), estimate=(*parts, *hardness), **seen),
         Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen),
-        Stage(groups=2, bin=2, **fine),
-        Stage(**finest, bin=2, **fine),
-        Stage(**finest, bin=1, **{**fine, **weighed}),
+        Stage(groups=2, bin=2, before=after_others, **fine),
+        Stage(**finest, bin=2, before=after_others, **fine),
+        Stage(**finest, bin=1, before=(*after_others, *weighed), **fine),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
