@@ -33,7 +33,7 @@ class LoadPrior:
     """
 
     force: float = 300.0
-    moment: float = 5000.0
+    moment: float = 2000.0
 
 
 @dataclass(frozen=True, eq=False)
