@@ -168,12 +168,14 @@ def _add_info(commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    from torchkcreg.experiments import describe, describe_installation
+    from torchkcreg.experiments import describe, describe_installation, runs_compared
 
     if not options.paths:
         print(describe_installation())
     for path in options.paths:
         print(describe(path, open_beam=options.open_beam))
+    if compared := runs_compared(options.paths):
+        print(compared)
 
 
 def _add_demo(commands) -> None:

@@ -10,6 +10,7 @@ from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_
 from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles, ReconstructionOptions
 from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
 from torchkcreg.experiments.registered_components import registered_components
+from torchkcreg.experiments.runs_compared import runs_compared
 from torchkcreg.experiments.seeds import SeedRuns, register_seeds
 
 __all__ = [
@@ -34,4 +35,5 @@ __all__ = [
     "registered_components",
     "resolve_config",
     "resolve_options",
+    "runs_compared",
 ]

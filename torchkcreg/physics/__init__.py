@@ -3,7 +3,7 @@
 from torchkcreg.physics.beam import Beam
 from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
 from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
-from torchkcreg.physics.elastic_constants import ElasticConstants, elastic_constants
+from torchkcreg.physics.elastic_constants import ElasticConstants, elastic_constants, is_elastic
 from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission, intensity_from_dict
 from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
 from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
@@ -24,6 +24,7 @@ __all__ = [
     "Veil",
     "calcium_in_water",
     "elastic_constants",
+    "is_elastic",
     "gaussian_blur",
     "gaussian_kernel",
     "intensity_from_dict",

@@ -44,6 +44,18 @@ def elastic_constants(name: str) -> ElasticConstants:
     return _table()[key]
 
 
+def is_elastic(name: str) -> bool:
+    """Whether the elastic constants of a packaged material are known.
+
+    Raises:
+        ValueError: If there is no such material.
+
+    >>> is_elastic("steel"), is_elastic("water")
+    (True, False)
+    """
+    return material(name).name in _table()
+
+
 @cache
 def _table() -> dict[str, ElasticConstants]:
     rows = packaged_rows("elastic.csv")

@@ -10,7 +10,7 @@ from torchkcreg.config import Config
 from torchkcreg.deformation import BendingPrior, Level
 
 SimilarityName = Literal["gradient-correlation", "gradient-difference"]
-DeformationName = Literal["ffd", "modes", "fe"]
+DeformationName = Literal["auto", "ffd", "modes", "fe"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
 
 PHYSICS = ("scatter", "removed", "blur", "hardness")  # what a polyenergetic intensity model offers
@@ -112,7 +112,7 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
     fine = {"estimate": every, **seen}
     after_others = ("background", "reweight")
-    weighed = ("weigh",) if deformation == "fe" else ()
+    weighed = ("weigh",) if deformation in ("fe", "auto") else ()
     hardness = ("scatter", "removed", "hardness")  # coarse pixels do not tell blur
     levels = [
         Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts),
@@ -156,7 +156,8 @@ class RegistrationConfig(Config):
         stages: The schedule itself, see :class:`Stage`.
         material: Name of the implant's material; None keeps plain path lengths (the paper's DRR).
         deformation: How the implant bends: "ffd" by groups of control points (the paper's model), "modes" by groups
-            along the implant's softest elastic modes, "fe" as an elastic body loaded at its holes.
+            along the implant's softest elastic modes, "fe" as an elastic body loaded at its holes; "auto" is "fe" where
+            the implant's stiffness is known, else "modes".
         pitch_mm: Lattice pitch of the implant's point cloud, mm.
         grid_shape: Control points along the principal axes, shortest axis first; grown where the implant needs more.
         grid_spacing_mm: Spacing of the control points, mm.

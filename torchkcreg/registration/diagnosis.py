@@ -10,7 +10,7 @@ from torch import Tensor
 from torchkcreg.scene import Assembly
 
 from .objective import Objective
-from .uncertainty import parameter_covariance
+from .uncertainty import Uncertainty
 from .verdict import Diagnostics, Rival
 
 _DIFFERENCE_MM = 0.01
@@ -52,13 +52,15 @@ def diagnose(
         rival: Where the implants fitted second best, if several places were tried.
     """
     rest, scene = objective.at_rest, objective.scene
-    covariance = parameter_covariance(objective, rest[0])
-    objective.moves.keep_covariance(covariance)
+    known = Uncertainty.of(objective, rest[0])
+    objective.moves.keep_covariance(known.covariance)
     seen = [seen_shares(assembly, objective) for assembly in scene]
     return Diagnostics(
         gc=gc,
         misfit=1 - float(objective.similarities(rest).mean()),
-        node_std_mm=node_deviation(objective, rest[0], covariance),
+        node_std_mm=node_deviation(objective, rest[0], known.covariance),
+        effective_parameters=known.effective_parameters,
+        blocks=known.blocks,
         seen=[min(shares) for shares in zip(*seen, strict=True)],
         strain=max(assembly.rms_strain() for assembly in scene),
         folds=any(_folds(assembly) for assembly in scene),

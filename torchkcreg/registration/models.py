@@ -10,7 +10,7 @@ from torch import Tensor
 from torchkcreg.deformation import Deformation, FiniteElementDeformation, FreeFormDeformation
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
 from torchkcreg.mechanics import Hold, LoadPrior, Superelement, holds_of
-from torchkcreg.physics import elastic_constants
+from torchkcreg.physics import elastic_constants, is_elastic
 from torchkcreg.splines import default_grid
 
 from .config import RegistrationConfig
@@ -44,12 +44,14 @@ DeformationFactory = Callable[[Implant, RegistrationConfig], Deformation]
 
 
 def deformation_of(implant: Implant, config: RegistrationConfig) -> Deformation:
-    """The deformation that a configuration describes.
+    """The deformation that a configuration describes; "auto": finite elements where the stiffness is known.
 
     Raises:
         ValueError: If finite elements are asked for an implant whose material is not said, or has no known stiffness.
     """
-    if config.deformation == "fe":
+    material = implant.material or config.material
+    known = material is not None and is_elastic(material)
+    if config.deformation == "fe" or (config.deformation == "auto" and known):
         return finite_elements(implant, config)
     grid = default_grid(implant.cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
     return FreeFormDeformation(grid, prior=config.bending_prior)

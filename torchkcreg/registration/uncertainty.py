@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,56 +17,77 @@ _DIFFERENCE_MM = 0.01
 _SEEN = 1e-3  # of the largest curvature: directions that images tell something about
 
 
-@torch.no_grad()
-def parameter_covariance(objective: Objective, parameters: Tensor) -> Tensor:
-    """Covariance (D, D) of the parameters at the optimum of a stage, mm^2.
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What is known of parameters (D,) near the optimum of a stage; second derivatives of the loss, (D, D).
 
-    ``C = H^-1 (sum_b g_b g_b^T + 2 w P) H^-1`` (Huber 1967; clusters as in Liang & Zeger 1986): H is the curvature of
-    the loss, penalties included, g_b the share that one block of pixels has in its gradient. The blocks' shares sum to
-    nothing but the penalty's gradient; what they scatter is how far the optimum would move if the blocks had been
-    others. That holds for model error too, which is no noise: what matters is that it hangs together within blocks and
-    not beyond. Where a penalty is w times the square of deviations from a prior, its curvature P draws the optimum
-    towards what the prior expects, which is as likely off as that says: 2 w P.
-
-    Args:
-        objective: Of a stage whose parameters are at their optimum.
-        parameters: The optimum, shape (D,).
+    Attributes:
+        images: Curvature of the similarity.
+        disagreement: Sum of the squares of its gradients over blocks of pixels.
+        penalties: Curvature of what speaks against parameters but the images.
+        priors: Twice the weight of each prior times its curvature.
+        blocks: How many blocks of pixels say something.
     """
-    curvature, disagreement = _of_images(objective, parameters)
-    curvature = curvature + _curvature(objective.penalty, parameters)
-    floor = curvature.diagonal().mean() * torch.eye(len(curvature), dtype=curvature.dtype, device=curvature.device)
-    bread = torch.linalg.inv(curvature + 1e-9 * floor)
-    return bread @ (disagreement + _of_priors(objective.moves, parameters)) @ bread
 
+    images: Tensor
+    disagreement: Tensor
+    penalties: Tensor
+    priors: Tensor
+    blocks: int
 
-@torch.no_grad()
-def loss_of_a_deviation(objective: Objective, parameters: Tensor) -> float:
-    """The loss that images alone have where a parameter is one standard deviation off what they say.
+    @classmethod
+    @torch.no_grad()
+    def of(cls, objective: Objective, parameters: Tensor) -> Uncertainty:
+        """Of a stage near its optimum."""
+        jacobian, residuals = objective.jacobian(parameters, _DIFFERENCE_MM)
+        share = 0.5 / objective.images.num_views
+        flat = jacobian.flatten(1)
+        size = max(1, round(_BLOCK_MM / objective.view.geometry.pixel_spacing[1]))
+        shares = share * torch.stack([_block_sums((row * residuals).sum(1), size) for row in jacobian]).double()
+        blocks = max(int((shares != 0).any(0).sum()), 2)
+        return cls(
+            share * (flat @ flat.T).double(),
+            blocks / (blocks - 1) * shares @ shares.T,
+            _curvature(objective.penalty, parameters),
+            _of_priors(objective.moves, parameters),
+            blocks,
+        )
 
-    Half the ratio of what blocks of pixels disagree about to curvature; it is about the same in all directions. A prior
-    that is one standard deviation off at the same loss is as likely off as the images, and counts as it should.
+    @property
+    def covariance(self) -> Tensor:
+        """Covariance (D, D) of the parameters, mm^2.
 
-    Args:
-        objective: Of a stage.
-        parameters: Near its optimum, shape (D,).
-    """
-    curvature, disagreement = _of_images(objective, parameters)
-    values, directions = torch.linalg.eigh(curvature)
-    seen = values > _SEEN * values.max()
-    ratio = torch.einsum("da,de,ea->a", directions, disagreement, directions)[seen] / values[seen]
-    return float(ratio.median()) / 2
+        ``C = H^-1 (sum_b g_b g_b^T + 2 w P) H^-1`` (Huber 1967; clusters as in Liang & Zeger 1986): H is the curvature
+        of the loss, penalties included, g_b the share that one block of pixels has in its gradient. The blocks' shares
+        sum to nothing but the penalty's gradient; what they scatter is how far the optimum would move if the blocks had
+        been others. That holds for model error too, which is no noise: what matters is that it hangs together within
+        blocks and not beyond. Where a penalty is w times the square of deviations from a prior, its curvature P draws
+        the optimum towards what the prior expects, which is as likely off as that says: 2 w P.
+        """
+        bread = self._bread()
+        return bread @ (self.disagreement + self.priors) @ bread
 
+    @property
+    def loss_of_a_deviation(self) -> float:
+        """The loss that images alone have where a parameter is one standard deviation off what they say.
 
-def _of_images(objective: Objective, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """Curvature (D, D) of the similarity, and the sum (D, D) of its blocks' gradients' squares."""
-    jacobian, residuals = objective.jacobian(parameters, _DIFFERENCE_MM)
-    share = 0.5 / objective.images.num_views
-    flat = jacobian.flatten(1)
-    curvature = share * (flat @ flat.T).double()
-    size = max(1, round(_BLOCK_MM / objective.view.geometry.pixel_spacing[1]))
-    shares = share * torch.stack([_block_sums((row * residuals).sum(1), size) for row in jacobian]).double()
-    blocks = max(int((shares != 0).any(0).sum()), 2)
-    return curvature, blocks / (blocks - 1) * shares @ shares.T
+        Half the ratio of what blocks of pixels disagree about to curvature; it is about the same in all directions. A
+        prior whose standard deviation costs as much counts as it should beside the images.
+        """
+        values, directions = torch.linalg.eigh(self.images)
+        seen = values > _SEEN * values.max()
+        ratio = torch.einsum("da,de,ea->a", directions, self.disagreement, directions)[seen] / values[seen]
+        return float(ratio.median()) / 2
+
+    @property
+    def effective_parameters(self) -> float:
+        """How many parameters the images determine, the rest being left to penalties: the trace of H^-1 H_images."""
+        return float((self._bread() @ self.images).trace())
+
+    def _bread(self) -> Tensor:
+        whole = self.images + self.penalties
+        same = torch.eye(len(whole), dtype=whole.dtype, device=whole.device)
+        return torch.linalg.inv(whole + 1e-9 * whole.diagonal().mean() * same)
 
 
 def _of_priors(blocks: ParameterBlocks, parameters: Tensor) -> Tensor:

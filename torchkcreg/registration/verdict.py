@@ -48,6 +48,8 @@ class Diagnostics:
         undone: Number of each stage that was undone, from 1 on, and why.
         rival: Where the implant fitted second best, if several places were tried.
         screws_found: How many screws were found that nobody told of.
+        effective_parameters: How many parameters the images determine.
+        blocks: How many blocks of pixels say something.
     """
 
     gc: list[float]
@@ -61,6 +63,8 @@ class Diagnostics:
     undone: dict[str, str] = field(default_factory=dict)
     rival: Rival | None = None
     screws_found: int = 0
+    effective_parameters: float = 0.0
+    blocks: int = 0
 
 
 def judge(found: Diagnostics) -> tuple[Status, list[str]]:
