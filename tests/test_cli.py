@@ -14,7 +14,7 @@ from torchkcreg.io import read_components, read_geometry, read_points, read_proj
 
 FIGURES = {"overlay.png", "displacement.png", "history.png"}
 RUN_FILES = {"config.yaml", "versions.json", "checkpoint.pt", "history.json", "metrics.json", "deformation.json"}
-EXPORTS = {"dvf.mha", "bspline.tfm", "implant_deformed.ply"}
+EXPORTS = {"dvf.mha", "arrays.npz", "implant_deformed.ply"}
 
 
 def command(case, out, **changes):
@@ -77,7 +77,7 @@ def test_a_registration_finds_most_of_the_motion(small_case, finished, tmp_path)
     torch.testing.assert_close(warped, read_run(finished).warp(before), rtol=0, atol=1e-6)
 
 
-def test_warp_flags_points_beyond_the_control_points(finished, tmp_path, capsys):
+def test_warp_flags_points_beyond_the_implant(finished, tmp_path, capsys):
     (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n0,0,500\n")
     assert (
         main(["warp", f"--run={finished}", f"--points={tmp_path / 'points.csv'}", f"--out={tmp_path / 'w.csv'}"]) == 0
@@ -85,7 +85,7 @@ def test_warp_flags_points_beyond_the_control_points(finished, tmp_path, capsys)
     lines = (tmp_path / "w.csv").read_text().splitlines()
     assert lines[0] == "x,y,z,outside"
     assert [line.rsplit(",", 1)[1] for line in lines[1:]] == ["0", "1"]
-    assert "1 of 2 points lie beyond the control points" in capsys.readouterr().err
+    assert "1 of 2 points lie beyond the implant's reach" in capsys.readouterr().err
 
 
 def test_evaluate_prints_and_writes_the_error(small_case, finished, tmp_path, capsys):
@@ -102,7 +102,7 @@ def test_info_describes_each_file_in_its_own_words(small_case, finished, capsys)
     names = ("implant.stl", "geometry.json", "projections.npz")
     assert main(["info", *(str(small_case / name) for name in names), str(finished)]) == 0
     out = capsys.readouterr().out
-    for text in ("13.5 x 4.6 x 188 mm", "3 views of 192 x 80 pixels", "source T1", "control points in 2 groups"):
+    for text in ("13.5 x 4.6 x 188 mm", "3 views of 192 x 80 pixels", "source T1", "elastic body held at 10 places"):
         assert text in out
 
 

@@ -140,7 +140,7 @@ def test_files_give_it_back(element, bar) -> None:
 
 
 def test_a_stronger_prior_expects_more_and_one_hold_is_not_enough(bar, element) -> None:
-    twice = Superelement.of(bar, STEEL, HOLDS, prior=LoadPrior(600.0, 4000.0))
+    twice = Superelement.of(bar, STEEL, HOLDS, prior=LoadPrior(400.0, 3000.0))
     torch.testing.assert_close(twice.expected[:5], 2 * element.expected[:5], rtol=1e-6, atol=0)
     with pytest.raises(ValueError, match="held in two places or more, got 1"):
         Superelement.of(bar, STEEL, HOLDS[:1])
@@ -173,7 +173,7 @@ def test_a_hold_that_is_not_used_carries_nothing_and_the_rest_bends_as_if_it_wer
     assert float(carried[:, 1].abs().max()) < 1e-3 * float(carried.abs().max())
     fewer = Superelement.of(bar, STEEL, [HOLDS[0], *HOLDS[2:]])
     assert (1 / torch.linalg.eigvalsh(expected.precision)[:6].sqrt()).tolist() == pytest.approx(
-        fewer.expected[:6].tolist(), rel=5e-3
+        fewer.expected[:6].tolist(), rel=1e-2
     )
 
 

@@ -61,9 +61,11 @@ def test_nor_by_the_search_for_screws() -> None:
     assert len(result.screws_found) == 1
 
 
-def test_a_scene_moves_as_a_whole() -> None:
-    here = scene(CONFIG, components=[SCREW])
-    bend(here, 0.02)
+@pytest.mark.parametrize("model", ["modes", "fe"])
+def test_a_scene_moves_as_a_whole(model: str) -> None:
+    here = scene(CONFIG.model_copy(update={"deformation": model}), components=[SCREW])
+    if model == "modes":
+        bend(here, 0.02)
     moved = copy.deepcopy(here).to("meta")
     tensors = tensors_of(moved, set())
     assert len(tensors) > 20

@@ -112,6 +112,18 @@ def test_the_background_behind_the_implant_is_that_around_it() -> None:
     torch.testing.assert_close(estimate, bone, atol=1.0, rtol=0)
 
 
+def test_a_background_is_sane_where_nothing_was_measured() -> None:
+    config = PLAIN.model_copy(update={"material": "steel", "background_mm": 2.5})
+    data = image(scene(config))
+    mask = torch.zeros_like(data.line_integrals, dtype=torch.bool)
+    mask[:, 70:90, 40:56] = True  # the open beam around it saturates
+    dark = RegistrationData(data.geometry, torch.zeros_like(data.line_integrals), mask)
+    estimate = with_background(scene(config), dark, config.background_mm).background
+    assert bool(torch.isfinite(estimate).all())
+    assert not estimate[:, :40].any()
+    assert float(estimate.abs().max()) < 2001
+
+
 def test_the_scatter_floor_is_estimated() -> None:
     config = RegistrationConfig(
         material="steel", scatter=0.1, prior_weight=0.0, stages=(Stage(estimate=("scatter",), tolerance=1e-4),), **GRID

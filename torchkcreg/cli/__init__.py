@@ -75,8 +75,8 @@ def _warp(options: argparse.Namespace) -> None:
     outside = implant.outside(points)
     if outside.any():
         warnings.warn(
-            f"{int(outside.sum())} of {len(points)} points lie beyond the control points: "
-            "they move rigidly with the nearest group",
+            f"{int(outside.sum())} of {len(points)} points lie beyond the implant's reach: "
+            "they move rigidly with its nearest part",
             stacklevel=1,
         )
     write_points(options.out, implant.warp(points), outside=outside)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from torchkcreg.deformation import FreeFormDeformation
+from torchkcreg.deformation import FiniteElementDeformation, FreeFormDeformation
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.implant import volume
 from torchkcreg.io import RunFolder, geometry_from_dict, read_json, read_mesh, read_projections, versions
@@ -130,6 +130,9 @@ def _run(path: Path) -> str:
 
 def _size(implant: RegisteredImplant) -> str:
     deformation = implant.deformation
+    if isinstance(deformation, FiniteElementDeformation):
+        element = deformation.superelement
+        return f"{implant.name}: elastic body held at {len(element.holds)} places, {element.num_amounts} ways to bend"
     if not isinstance(deformation, FreeFormDeformation):
         return f"{implant.name}: {deformation.model} deformation"
     shape = " x ".join(str(n) for n in deformation.grid.shape)

@@ -63,7 +63,7 @@ class CarriedLoad:
         axes = _axes(element)
         expected = expected or ExpectedLoads.of(element)
         covariance = expected.covariance if covariance is None else covariance
-        places = torch.tensor([hold.center for hold in element.holds], dtype=torch.float64).to(axes)
+        places = axes.new_tensor([hold.center for hold in element.holds])
         turned = torch.block_diag(axes, axes)
         loads, stiff = expected.loads_of(element) @ turned.mT, element.stiff @ turned.mT
         low, high = element.sections.heights[0], element.sections.heights[-1]

@@ -63,7 +63,7 @@ def holds_of(cloud: ImplantPointCloud, holes: Sequence[Hole] = ()) -> list[Hold]
         else:
             places.append([hole])
     holds = [_at(number, place) for number, place in enumerate(places, start=1)]
-    heights = [float(torch.tensor(h.center).double() @ along.cpu()) for h in holds]
+    heights = [float(along.new_tensor(h.center) @ along) for h in holds]
     if len(holds) >= _FEWEST_HOLES and max(heights) - min(heights) >= _SPANNED * length:
         return holds
     return _patches(cloud, middle, along, length, float(extents[:-1].max()))
@@ -102,7 +102,7 @@ def unit_loads(cloud: ImplantPointCloud, holds: Sequence[Hold]) -> tuple[list[Te
         chosen = hold.nodes(cloud.points)
         points, volumes = cloud.points[chosen].double(), cloud.volumes[chosen].double()[:, None]
         arms = points - points.new_tensor(hold.center)
-        axes = torch.eye(3, dtype=points.dtype)
+        axes = torch.eye(3, dtype=points.dtype, device=points.device)
         fields = [axis.expand_as(points) for axis in axes] + [
             torch.linalg.cross(axis.expand_as(arms), arms) for axis in axes
         ]

@@ -32,8 +32,8 @@ class LoadPrior:
         moment: About each axis, N mm.
     """
 
-    force: float = 300.0
-    moment: float = 2000.0
+    force: float = 200.0
+    moment: float = 1500.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class Superelement:
             expected,
             prior,
             stiff.unflatten(-1, (-1, 6)),
-            torch.einsum("al,lni->ani", ways, units),
+            torch.einsum("al,lni->ani", ways, units).float().double(),  # as files keep them
             shifts,
             turns,
         )
@@ -199,7 +199,7 @@ class Superelement:
 
 
 def _numbers(value: Any) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)
+    return torch.as_tensor(value, dtype=torch.float64, device="cpu")
 
 
 def _with_tuples(content: dict[str, Any]) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def _with_tuples(content: dict[str, Any]) -> dict[str, Any]:
 
 def _balanced(holds: Sequence[Hold], scale: Tensor) -> Tensor:
     """Orthonormal combinations (6 H - 6, 6 H) of scaled loads at holds whose force and moment vanish."""
-    places = torch.tensor([h.center for h in holds], dtype=torch.float64)
+    places = scale.new_tensor([h.center for h in holds])
     places = (places - places.mean(0)).to(scale)
     same = torch.eye(3, dtype=scale.dtype, device=scale.device)
     rows = []

@@ -16,6 +16,9 @@ from .scene import Scene
 _ITERATIONS = 4
 _PROBE_MM = 0.5
 _COARSEST_BIN = 4
+_LEAST_MEASURED = 0.01  # of a window: where fewer pixels are valid nothing is known of the background
+_LEAST_SLOPE = 1e-3  # 1/mm, of the logarithm of the signal
+_RANGE_MM = (-100.0, 2000.0)  # a limb's thickness in any view, and errors of the model on the other side
 
 
 @torch.no_grad()
@@ -65,13 +68,15 @@ class _BackgroundFit:
         physics = {**self.physics, "scatter": none, "scatter_removed": none}
         primary = self.measured - scattered_signal(levels, self.images.scatter_shapes)[0]
         background = torch.zeros_like(primary)
+        measured = gaussian_blur(self.images.mask.to(primary), self.sigma) > _LEAST_MEASURED
         for _ in range(_ITERATIONS):
             known = self._transmission(background, physics)
             squares = self._window(known.square())
             further = self._transmission(background + _PROBE_MM, physics)
             slope = (squares / self._window(known * further)).log() / _PROBE_MM
             ratio = self._window(known * primary) / squares
-            background = background - ratio.clamp(0.02, 5.0).log() / slope.clamp_min(1e-3)
+            step = ratio.clamp(0.02, 5.0).log() / slope.clamp_min(_LEAST_SLOPE)
+            background = torch.where(measured, background - step, background).clamp(*_RANGE_MM)
         return background
 
     def _transmission(self, background: Tensor, physics: dict[str, Tensor]) -> Tensor:
