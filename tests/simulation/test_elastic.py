@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,7 +12,7 @@ from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.physics import elastic_constants
 from torchkcreg.simulation import draw_case, random_case
-from torchkcreg.simulation.elastic import elastic_motion
+from torchkcreg.simulation.elastic import Fragments, elastic_motion
 from torchkcreg.simulation.population import motions, view_geometry
 
 DRAW = replace(draw_case(1), loose=None)  # titanium, straight holes 0, 1 below and 4, 5, 6 above, of seven
@@ -21,6 +22,13 @@ DRAW = replace(draw_case(1), loose=None)  # titanium, straight holes 0, 1 below 
 def case():
     geometry = view_geometry(DRAW, "neighbours")
     return random_case(DRAW, elastic=True, counts=torch.zeros(3, *geometry.det_shape))
+
+
+def moving(case):
+    """The plate's motion and what it carries, of two fragments that turn by a degree."""
+    held = Fragments([DRAW.hole_heights[hole] for hole in DRAW.holes_used], (1.0, 0.2, 0.5))
+    pose, rng = torch.eye(4, dtype=torch.float64), np.random.default_rng(0)
+    return elastic_motion(motions(DRAW)[0], case.implant, DRAW.material, held, pose, rng)
 
 
 def test_only_screws_carry_and_what_they_carry_is_in_balance(case) -> None:
@@ -45,8 +53,7 @@ def test_between_the_fragments_moments_change_as_the_shear_force_says(case) -> N
 
 
 def test_highest_stresses_are_such_as_the_alloy_bears(case) -> None:
-    rest, _ = motions(DRAW)
-    motion, _ = elastic_motion(DRAW, rest, case.implant)
+    motion = moving(case)[0]
     element, limit = motion.deformation.superelement, elastic_constants(DRAW.material).yield_stress
     points = torch.as_tensor(case.implant.vertices.copy())
     stress = element.stress(points, motion.deformation.amounts.detach())
@@ -56,8 +63,7 @@ def test_highest_stresses_are_such_as_the_alloy_bears(case) -> None:
 
 
 def test_screws_and_sections_go_with_the_plate(case) -> None:
-    rest, _ = motions(DRAW)
-    motion, _ = elastic_motion(DRAW, rest, case.implant)
+    motion = moving(case)[0]
     heights = torch.tensor([-30.0, 0.0, 25.0], dtype=torch.float64)
     frames = motion.frames(heights)
     local = torch.tensor([[3.0, 1.0, 0.0], [-3.0, -1.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
@@ -81,7 +87,7 @@ def test_the_plate_moves_by_the_drawn_misalignment_on_average(case) -> None:
 
 def test_a_loose_screw_carries_nothing() -> None:
     draw = replace(DRAW, loose=4)
-    rest, _ = motions(draw)
-    plate = random_case(draw, counts=torch.zeros(3, *view_geometry(draw, "neighbours").det_shape)).implant
-    _, carried = elastic_motion(draw, rest, plate)
+    carried = random_case(
+        draw, elastic=True, counts=torch.zeros(3, *view_geometry(draw, "neighbours").det_shape)
+    ).carried
     assert float(carried.hold_loads[6].abs().max()) < 1e-3 * float(carried.hold_loads.abs().max())

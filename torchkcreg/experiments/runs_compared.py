@@ -31,8 +31,8 @@ def runs_compared(paths: Sequence[Path]) -> str:
     ranked = sorted((blocks * math.log(f["misfit"]) + 2 * f["effective_parameters"], path, f) for path, _, f in same)
     lines = ["which explains the same images better (difference of Akaike's criterion):"]
     for value, path, found in ranked:
-        told = f"misfit {found['misfit']:.4f} with {found['effective_parameters']:.1f} effective parameters"
-        lines.append(f"  {path}: +{value - ranked[0][0]:.1f}, {told}")
+        words = f"misfit {found['misfit']:.4f} with {found['effective_parameters']:.1f} effective parameters"
+        lines.append(f"  {path}: +{value - ranked[0][0]:.1f}, {words}")
     return "\n".join(lines)
 
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from torchkcreg.scene import Assembly
 
 from .objective import Objective
-from .uncertainty import Uncertainty
 from .verdict import Diagnostics, Rival
 
 _DIFFERENCE_MM = 0.01
@@ -52,7 +51,7 @@ def diagnose(
         rival: Where the implants fitted second best, if several places were tried.
     """
     rest, scene = objective.at_rest, objective.scene
-    known = Uncertainty.of(objective, rest[0])
+    known = objective.uncertainty(rest[0])
     objective.moves.keep_covariance(known.covariance)
     seen = [seen_shares(assembly, objective) for assembly in scene]
     return Diagnostics(

@@ -11,6 +11,7 @@ from torchkcreg.scene import Moves, Scene, State, View
 from torchkcreg.similarity import Similarity, sobel_gradient
 
 from .robust import residual_weights
+from .uncertainty import Uncertainty
 
 Penalty = Callable[[State], Tensor]
 SimilarityFactory = Callable[[Tensor, Tensor | None, Tensor | None], Similarity]
@@ -109,6 +110,12 @@ class Objective:
         center = self._residuals(parameters[None])
         steps = [(self._residuals(parameters + o) - center) / step_mm for o in offsets.split(self._batch())]
         return torch.cat(steps), center[0]
+
+    def uncertainty(self, parameters: Tensor) -> Uncertainty:
+        """How sure the images are of parameters (D,) near the optimum."""
+        jacobian, residuals = self.jacobian(parameters)
+        pixel = self.view.geometry.pixel_spacing[1]
+        return Uncertainty.of(jacobian, residuals, self.moves, self.penalty, parameters, pixel_mm=pixel)
 
     def _residuals(self, candidates: Tensor) -> Tensor:
         return self.similarity.residuals(self.line_integrals(candidates))

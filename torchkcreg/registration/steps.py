@@ -15,7 +15,6 @@ from .basins import places
 from .config import Stage
 from .screws import find_screws, of_best_metal, screws_by_metal
 from .stage_run import StageRun, Step
-from .uncertainty import Uncertainty
 from .verdict import Rival
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
@@ -66,7 +65,7 @@ def reweight(run: StageRun) -> None:
 def weigh(run: StageRun) -> None:
     """Tells priors without a weight of their own how much the images are worth, see `Uncertainty`."""
     objective = run.objective
-    loss = Uncertainty.of(objective, objective.at_rest[0]).loss_of_a_deviation
+    loss = objective.uncertainty(objective.at_rest[0]).loss_of_a_deviation
     for block in objective.moves.values():
         block.weigh(loss)
 

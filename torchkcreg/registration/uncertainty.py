@@ -10,10 +10,7 @@ from torch import Tensor
 
 from torchkcreg.parameters import ParameterBlocks
 
-from .objective import Objective
-
 _BLOCK_MM = 12.0  # on the detector: residuals of bone edges, beads and scatter hang together over about that much
-_DIFFERENCE_MM = 0.01
 _SEEN = 1e-3  # of the largest curvature: directions that images tell something about
 
 
@@ -37,20 +34,37 @@ class Uncertainty:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, objective: Objective, parameters: Tensor) -> Uncertainty:
-        """Of a stage near its optimum."""
-        jacobian, residuals = objective.jacobian(parameters, _DIFFERENCE_MM)
-        share = 0.5 / objective.images.num_views
+    def of(
+        cls,
+        jacobian: Tensor,
+        residuals: Tensor,
+        blocks: ParameterBlocks,
+        penalty: Callable[[Tensor], Tensor],
+        parameters: Tensor,
+        *,
+        pixel_mm: float,
+    ) -> Uncertainty:
+        """Of residual images.
+
+        Args:
+            jacobian: Their derivatives (D, V, 2, rows, cols).
+            residuals: Shape (V, 2, rows, cols).
+            blocks: The parameters.
+            penalty: Of candidates (K, D).
+            parameters: The optimum, shape (D,).
+            pixel_mm: Of the images.
+        """
+        share = 0.5 / len(residuals)
         flat = jacobian.flatten(1)
-        size = max(1, round(_BLOCK_MM / objective.view.geometry.pixel_spacing[1]))
+        size = max(1, round(_BLOCK_MM / pixel_mm))
         shares = share * torch.stack([_block_sums((row * residuals).sum(1), size) for row in jacobian]).double()
-        blocks = max(int((shares != 0).any(0).sum()), 2)
+        number = max(int((shares != 0).any(0).sum()), 2)
         return cls(
             share * (flat @ flat.T).double(),
-            blocks / (blocks - 1) * shares @ shares.T,
-            _curvature(objective.penalty, parameters),
-            _of_priors(objective.moves, parameters),
-            blocks,
+            number / (number - 1) * shares @ shares.T,
+            _curvature(penalty, parameters),
+            _of_priors(blocks, parameters),
+            number,
         )
 
     @property

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,11 +11,10 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.deformation import FiniteElementDeformation
-from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
+from torchkcreg.geometry import fit_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud, find_holes
 from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
 from torchkcreg.physics import elastic_constants
-from torchkcreg.simulation.draws import Draw
 from torchkcreg.simulation.loads import RodMotion
 
 _PITCH_MM = 0.3
@@ -50,48 +50,61 @@ class ElasticMotion:
         return torch.stack([fit_rigid(around, moved) for moved in self(lifted)])
 
 
-def elastic_motion(draw: Draw, rest: RodMotion, plate: trimesh.Trimesh) -> tuple[ElasticMotion, CarriedLoad]:
-    """How a drawn plate moves on its screws, and what it carries.
+@dataclass(frozen=True)
+class Fragments:
+    """Two pieces of bone, each rigid, and the screws that hold a plate on them.
 
-    Each fragment is rigid and the one above turns against the one below by the drawn angles, about the plate's middle
-    between them; screws that hold yield in their bone by springs. The load is scaled so that the plate's highest
-    stresses are a drawn share of the yield stress.
+    Attributes:
+        heights: Of the screws that hold, on the straight plate, mm; those below 0 are in one fragment.
+        turn_deg: Rotation vector of the upper fragment against the lower one, about the origin.
+        shift: Translation of it after that, mm.
+    """
+
+    heights: Sequence[float]
+    turn_deg: tuple[float, float, float]
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def elastic_motion(
+    rest: RodMotion, plate: trimesh.Trimesh, material: str, fragments: Fragments, pose: Tensor, rng: np.random.Generator
+) -> tuple[ElasticMotion, CarriedLoad]:
+    """How a plate moves on its screws, and what it carries.
+
+    Screws yield in their bone by springs of random stiffness. The load is scaled so that the plate's highest stresses
+    are a random share of the yield stress.
 
     Args:
-        draw: What was drawn.
         rest: From the straight plate to the undeformed one.
         plate: The undeformed one.
+        material: Of it.
+        fragments: What bends it.
+        pose: Rigid motion (4, 4) of the plate as a whole, besides.
+        rng: Where the random numbers come from.
     """
-    rng = np.random.default_rng([draw.seed, 22])
     cloud = ImplantPointCloud.from_mesh(plate, _PITCH_MM)
     holds = holds_of(cloud, find_holes(plate))
-    element = Superelement.of(cloud, elastic_constants(draw.material), holds, negligible_mm=0.0)
-    amounts = _amounts(draw, rest, element, rng)
+    element = Superelement.of(cloud, elastic_constants(material), holds, negligible_mm=0.0)
+    amounts = _amounts(fragments, rest, element, rng)
     stress = von_mises(element.stress(torch.from_numpy(np.array(plate.vertices)), amounts))
     share = rng.uniform(*_SHARES) * element.constants.yield_stress
     amounts = amounts * share / float(stress.quantile(_HIGHEST))
     deformation = FiniteElementDeformation(element, amounts)
     nodes = cloud.coarsened(6).points.double()
-    turn = torch.deg2rad(torch.tensor(draw.turn_deg, dtype=torch.float64))
-    misaligned = rigid_matrix(turn, torch.tensor(draw.shift, dtype=torch.float64))
     with torch.no_grad():
         common = fit_rigid(nodes, deformation(nodes))
-    motion = ElasticMotion(rest, deformation, misaligned @ torch.linalg.inv(common))
+    motion = ElasticMotion(rest, deformation, pose @ torch.linalg.inv(common))
     return motion, CarriedLoad.of(element, amounts)
 
 
-def _amounts(draw: Draw, rest: RodMotion, element: Superelement, rng: np.random.Generator) -> Tensor:
+def _amounts(fragments: Fragments, rest: RodMotion, element: Superelement, rng: np.random.Generator) -> Tensor:
     """Amounts (A,) for which used holds move as fragments and springs have it, and the others carry nothing."""
     centers = torch.tensor([hold.center for hold in element.holds], dtype=torch.float64)
-    heights = [draw.hole_heights[hole] for index, hole in enumerate(draw.holes_used) if index != draw.loose]
-    middles = rest(torch.tensor([[0.0, 0.0, z] for z in heights], dtype=torch.float64))
+    middles = rest(torch.tensor([[0.0, 0.0, z] for z in fragments.heights], dtype=torch.float64))
     used = torch.cdist(middles, centers).argmin(1).tolist()
-    above = torch.tensor([z > 0 for z in heights], dtype=torch.float64)
-    angles = torch.tensor([draw.bend_deg, draw.lateral_deg, draw.torsion_deg], dtype=torch.float64)
-    arm = min(z for z in heights if z > 0) - max(z for z in heights if z < 0)
-    offset = torch.tensor([0.0, math.radians(draw.s_bend_deg) * arm / 4, 0.0], dtype=torch.float64)
-    turn = torch.deg2rad(angles).expand(len(used), 3)
-    wanted = torch.cat([torch.linalg.cross(turn, centers[used]) + offset, turn], dim=1) * above[:, None]
+    above = torch.tensor([z > 0 for z in fragments.heights], dtype=torch.float64)
+    turn = torch.deg2rad(torch.tensor(fragments.turn_deg, dtype=torch.float64)).expand(len(used), 3)
+    shift = torch.tensor(fragments.shift, dtype=torch.float64)
+    wanted = torch.cat([torch.linalg.cross(turn, centers[used]) + shift, turn], dim=1) * above[:, None]
     springs = rng.lognormal(0.0, 0.5, size=(len(used), 1)) * np.array([_SCREW_SHEAR] * 3 + [_SCREW_TURN] * 3)
     moved = _hold_motions(element, used)  # (A, U, 6)
     loads = element.loads

@@ -17,7 +17,7 @@ from torchkcreg.implant import Screw
 from torchkcreg.physics import tungsten_spectrum
 from torchkcreg.simulation.cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase, fragment_at
 from torchkcreg.simulation.draws import Draw, draw_case
-from torchkcreg.simulation.elastic import ElasticMotion, elastic_motion
+from torchkcreg.simulation.elastic import ElasticMotion, Fragments, elastic_motion
 from torchkcreg.simulation.hardware import locking_plate
 from torchkcreg.simulation.loads import Load, RodMotion
 from torchkcreg.simulation.parts import Part
@@ -46,7 +46,9 @@ def random_case(
     rest, loaded = motions(draw)
     straight, carried = _straight_plate(draw), None
     if elastic:
-        loaded, carried = elastic_motion(draw, rest, _mapped(straight, rest))
+        rng = np.random.default_rng([draw.seed, 22])
+        pose = _misalignment(draw)
+        loaded, carried = elastic_motion(rest, _mapped(straight, rest), draw.material, _fragments(draw), pose, rng)
 
     def deform(points: Tensor) -> Tensor:
         return loaded(rest.straightened(points)).to(points.dtype)
@@ -129,10 +131,21 @@ def motions(draw: Draw) -> tuple[RodMotion, PlateMotion]:
     stretch = (-half, half)
     rest = RodMotion(lambda z: bow.expand(len(z), 3), stretch)
     nodes = torch.cartesian_prod(*(torch.linspace(-x, x, n).double() for x, n in zip((6.0, 2.0, half), (2, 2, 65))))
-    turn = torch.deg2rad(torch.tensor(draw.turn_deg, dtype=torch.float64))
-    misaligned = rigid_matrix(turn, torch.tensor(draw.shift, dtype=torch.float64))
     common = fit_rigid(rest(nodes), RodMotion(loaded, stretch)(nodes))
-    return rest, RodMotion(loaded, stretch, misaligned @ torch.linalg.inv(common))
+    return rest, RodMotion(loaded, stretch, _misalignment(draw) @ torch.linalg.inv(common))
+
+
+def _misalignment(draw: Draw) -> Tensor:
+    turn = torch.deg2rad(torch.tensor(draw.turn_deg, dtype=torch.float64))
+    return rigid_matrix(turn, torch.tensor(draw.shift, dtype=torch.float64))
+
+
+def _fragments(draw: Draw) -> Fragments:
+    """The bone's two halves, and the screws that hold; the S-bend is a shift of one against the other."""
+    heights = [draw.hole_heights[hole] for index, hole in enumerate(draw.holes_used) if index != draw.loose]
+    arm = min(z for z in heights if z > 0) - max(z for z in heights if z < 0)
+    shift = (0.0, math.radians(draw.s_bend_deg) * arm / 4, 0.0)
+    return Fragments(heights, (draw.bend_deg, draw.lateral_deg, draw.torsion_deg), shift)
 
 
 def _straight_plate(draw: Draw) -> trimesh.Trimesh:
