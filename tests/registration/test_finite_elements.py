@@ -10,6 +10,7 @@ from small_scene import RIGID, image, plate
 from torchkcreg.io import RunFolder, read_run
 from torchkcreg.mechanics import CarriedLoad, Hold
 from torchkcreg.registration import Implant, RegistrationConfig, RegistrationResult, Stage, build_scene, register
+from torchkcreg.registration.models import deformation_of
 
 HOLDS = [Hold(f"at {z:.0f}", (0.0, 0.0, z), 4.0) for z in (-22.0, -7.0, 7.0, 22.0)]
 BENDING = Stage(groups=20, modes=12, oversampling=1, tolerance=1e-4)
@@ -82,3 +83,10 @@ def test_groups_alone_make_the_free_form_schedule() -> None:
     schedule = RegistrationConfig(deformation="ffd").schedule()
     assert all(stage.modes is None for stage in schedule) and schedule[-1].groups == 10
     assert RegistrationConfig(deformation="fe").schedule()[-1].modes == 40
+
+
+def test_auto_is_finite_elements_where_the_stiffness_is_known() -> None:
+    config = CONFIG.model_copy(update={"deformation": "auto"})
+    models = [deformation_of(Implant(plate(), material=m, holds=HOLDS), config).model for m in ("steel", "water", None)]
+    assert models == ["fe", "ffd", "ffd"]
+    assert RegistrationConfig(deformation="auto").schedule() == RegistrationConfig(deformation="fe").schedule()

@@ -29,7 +29,8 @@ def add_register(commands) -> None:
     command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
     command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")
     command.add_argument(
-        "--deformation", help="how it bends: fe (loads at its holes), modes (elastic modes), ffd (the paper's) or auto"
+        "--deformation",
+        help="how it bends: modes (elastic modes, default), fe (loads at its holes), ffd (the paper's), auto",
     )
     command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
     command.add_argument("--seed", type=int, help="seed of the random numbers")

@@ -192,7 +192,7 @@ class RegistrationConfig(Config):
     preset: PresetName = "gauss-newton"
     stages: tuple[Stage, ...] = ()
     material: str | None = None
-    deformation: DeformationName = "auto"
+    deformation: DeformationName = "modes"
     pitch_mm: float = Field(0.25, gt=0)
     grid_shape: tuple[int, int, int] = (6, 6, 10)
     grid_spacing_mm: tuple[float, float, float] = (8.75, 8.75, 17.5)
