@@ -99,7 +99,7 @@ def test_deviations_of_section_loads_are_those_of_draws(element, four_point) -> 
     drawn = torch.stack([CarriedLoad.of(element, four_point + d).section_loads for d in draws]).std(0)
     torch.testing.assert_close(stated.section_std, drawn, rtol=0.2, atol=1.0)
     torch.testing.assert_close(CarriedLoad.of(element, four_point).hold_std, 10 * stated.hold_std, rtol=1e-6, atol=1e-6)
-    assert float(CarriedLoad.of(element, four_point).hold_std[:, :3].max()) < 201  # N: the prior's
+    assert float(CarriedLoad.of(element, four_point).hold_std[:, :3].max()) < 301  # N: the prior's
 
 
 def test_ways_that_images_cannot_tell_keep_their_uncertainty(four_point) -> None:

@@ -109,6 +109,11 @@ class FiniteElementDeformation(Deformation):
         """What speaks against amounts (K, A) but the images, shape (K,): how strong the loads at the holds are."""
         return self.weight * torch.einsum("ka,ab,kb->k", amounts, self.expected.precision, amounts)
 
+    @torch.no_grad()
+    def surprise(self) -> float:
+        """Mean square of the loads in standard deviations of the prior."""
+        return float(self.amounts @ self.expected.precision @ self.amounts) / len(self.amounts)
+
     @property
     def loads(self) -> Tensor:
         """Force and moment at each hold, (H, 6), N and N mm, in the implant's axes."""

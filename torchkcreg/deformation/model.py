@@ -96,6 +96,10 @@ class Deformation(nn.Module, ABC):
     def fixed_at(self, heads: Tensor) -> None:
         """Hears, before it moves, where components are fixed to it, heads (C, 3) in its frame; forgets by default."""
 
+    def surprise(self) -> float:
+        """Mean square of what a prior was told of, in its standard deviations: about one or less; 0 without a prior."""
+        return 0.0
+
     def jacobian(self, points: Tensor) -> Tensor:
         """Jacobians (..., N, 3, 3) of x -> x + u(x), [i, j] = d (x + u)_i / d x_j; central differences by default."""
         points, step = points.double(), 1e-3

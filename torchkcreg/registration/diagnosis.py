@@ -58,6 +58,7 @@ def diagnose(
         gc=gc,
         misfit=1 - float(objective.similarities(rest).mean()),
         node_std_mm=node_deviation(objective, rest[0], known.covariance),
+        surprise=max(assembly.deformation.surprise() for assembly in scene),
         effective_parameters=known.effective_parameters,
         blocks=known.blocks,
         seen=[min(shares) for shares in zip(*seen, strict=True)],

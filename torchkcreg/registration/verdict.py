@@ -14,6 +14,7 @@ _DEVIATION_MM, _ANYWHERE_MM = 0.065, 0.3
 _DEVIATION_FOUND_MM = 0.025  # with screws that nobody told of: their metal and shape may be others
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.0035  # root mean square strain
+_SURPRISING = 2.0  # mean square of loads in standard deviations; of plates on screws it is below one
 _APART_MM, _ALIKE = 2.0, 1.2  # another place, and how much more it leaves unexplained
 
 
@@ -48,6 +49,7 @@ class Diagnostics:
         undone: Number of each stage that was undone, from 1 on, and why.
         rival: Where the implant fitted second best, if several places were tried.
         screws_found: How many screws were found that nobody told of.
+        surprise: Mean square of what the deformation's prior was told of, in its standard deviations.
         effective_parameters: How many parameters the images determine.
         blocks: How many blocks of pixels say something.
     """
@@ -63,6 +65,7 @@ class Diagnostics:
     undone: dict[str, str] = field(default_factory=dict)
     rival: Rival | None = None
     screws_found: int = 0
+    surprise: float = 0.0
     effective_parameters: float = 0.0
     blocks: int = 0
 
@@ -114,6 +117,11 @@ def _doubts(found: Diagnostics) -> list[str]:
         reasons.append(f"less than {100 * _HARDLY_SEEN:.0f} % of the implant is seen in view {', '.join(hardly)}")
     if found.strain > _YIELD:
         reasons.append(f"the implant is strained by {100 * found.strain:.2f} % (RMS), more than metal bears")
+    if found.surprise > _SURPRISING:
+        reasons.append(
+            f"it takes loads {found.surprise**0.5:.1f} times as strong as expected to bend the implant so: it is held "
+            "or shaped otherwise than its finite elements have it; --deformation modes asks for no loads"
+        )
     if not found.converged:
         reasons.append("the last stage did not converge: it needs more iterations")
     reasons += [f"{name} ended at its bound" for name in found.at_bounds]
