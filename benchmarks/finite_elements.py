@@ -166,7 +166,7 @@ def main() -> None:
         difference = float((ours - theirs).norm() / theirs.norm())
         read = _read(element, inside, theirs)
         middle = float(read.section_loads[len(read.heights) // 2, moment])
-        true = _applied(read, holds, values, component, moment)
+        true = values[-1] if component == 5 else values[0] * float(read.hold_heights[0] - read.hold_heights[HOLES[1]])
         places, stress = fine.stress(solution)
         far = _far_from_holes(places, holes)
         vm = von_mises(torch.from_numpy(stress[far]))
@@ -192,13 +192,6 @@ def _read(element: Superelement, points: Tensor, moved: Tensor) -> CarriedLoad:
 
 def _ways(element: Superelement, points: Tensor) -> Tensor:
     return interpolated(element.hexahedra, element.nodal, *element.hexahedra.locate(points))
-
-
-def _applied(read: CarriedLoad, holds, values, component: int, moment: int) -> float:
-    if component == 5:
-        return values[-1]
-    heights = [float(read.hold_heights[hole]) for hole in HOLES]
-    return sum(v * (z - heights[1]) for v, z in zip(values[:1], heights[:1], strict=True))
 
 
 def _far_from_holes(places: np.ndarray, holes) -> np.ndarray:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchkcreg.geometry import invert_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for, interpolated
+from torchkcreg.mechanics.rigid import rigid_fields
 from torchkcreg.mechanics.stiffness import stiffness_matrix
 from torchkcreg.mechanics.stress import stresses, volumes_in_cubes
 from torchkcreg.physics import ElasticConstants
@@ -46,10 +47,10 @@ class ElasticBody:
         self.filled = volumes_in_cubes(self.hexahedra, cloud)
         positions = self.hexahedra.positions
         middle = positions.mean(0)
-        self._rigid = _rigid_fields(positions - middle)  # (6, N, 3)
+        self._rigid = rigid_fields(positions - middle)  # (6, N, 3)
         coarse = cloud.coarsened_to(_INERTIA_PITCH_MM)
         local = transform_points(invert_rigid(self.hexahedra.frame), coarse.points.double()) - middle
-        self._inertia = self.nodal_loads(coarse.points, _rigid_fields(local) * coarse.volumes.double()[:, None])
+        self._inertia = self.nodal_loads(coarse.points, rigid_fields(local) * coarse.volumes.double()[:, None])
         self._gram = torch.einsum("kni,lni->kl", self._inertia, self._rigid)
         self._pinned = _pinned(positions)
         self._factor = cholesky_banded(_banded(self.stiffness, self._pinned), lower=True, overwrite_ab=True)
@@ -94,14 +95,6 @@ class ElasticBody:
     def stress(self, points: Tensor, nodal: Tensor) -> Tensor:
         """Stresses (L, P, 3, 3) at points of the implant, N/mm^2, in its axes; see `stresses`."""
         return stresses(self.hexahedra, self.filled, self.constants, points, nodal)
-
-
-def _rigid_fields(positions: Tensor) -> Tensor:
-    """Three shifts and three turns (6, N, 3) of positions (N, 3)."""
-    axes = torch.eye(3, dtype=positions.dtype, device=positions.device)
-    shifts = axes[:, None].expand(3, len(positions), 3)
-    turns = torch.linalg.cross(axes[:, None].expand_as(shifts), positions[None].expand_as(shifts))
-    return torch.cat([shifts, turns])
 
 
 def _pinned(positions: Tensor) -> list[int]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.implant import Hole, ImplantPointCloud
+from torchkcreg.mechanics.rigid import rigid_fields
 
 _RIM_MM = 1.5  # around a hole's wall: what a screw's head presses on
 _JOINED = 2.2  # radii between centres: round holes that open into each other
@@ -102,12 +103,7 @@ def unit_loads(cloud: ImplantPointCloud, holds: Sequence[Hold]) -> tuple[list[Te
         chosen = hold.nodes(cloud.points)
         points, volumes = cloud.points[chosen].double(), cloud.volumes[chosen].double()[:, None]
         arms = points - points.new_tensor(hold.center)
-        axes = torch.eye(3, dtype=points.dtype, device=points.device)
-        fields = [axis.expand_as(points) for axis in axes] + [
-            torch.linalg.cross(axis.expand_as(arms), arms) for axis in axes
-        ]
-        basis = torch.stack(fields)  # rigid motions of the hold's nodes
-        spread = basis * volumes
+        spread = rigid_fields(arms) * volumes
         wrench = torch.stack([_wrench(arms, field) for field in spread], dim=-1)  # (6, 6): what each field amounts to
         loads = torch.einsum("kl,kpi->lpi", torch.linalg.inv(wrench), spread)
         where += [points] * 6

@@ -52,12 +52,13 @@ def diagnose(
     """
     rest, scene = objective.at_rest, objective.scene
     known = objective.uncertainty(rest[0])
-    objective.moves.keep_covariance(known.covariance)
+    covariance = known.covariance
+    objective.moves.keep_covariance(covariance)
     seen = [seen_shares(assembly, objective) for assembly in scene]
     return Diagnostics(
         gc=gc,
         misfit=1 - float(objective.similarities(rest).mean()),
-        node_std_mm=node_deviation(objective, rest[0], known.covariance),
+        node_std_mm=node_deviation(objective, rest[0], covariance),
         surprise=max(assembly.deformation.surprise() for assembly in scene),
         effective_parameters=known.effective_parameters,
         blocks=known.blocks,

@@ -14,6 +14,7 @@ from torchkcreg.deformation import FiniteElementDeformation
 from torchkcreg.geometry import fit_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud, find_holes
 from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
+from torchkcreg.mechanics.rigid import rigid_fields
 from torchkcreg.physics import elastic_constants
 from torchkcreg.simulation.loads import RodMotion
 
@@ -127,15 +128,10 @@ def _hold_motions(element: Superelement, holds: list[int]) -> Tensor:
     for hold in holds:
         near = element.holds[hold].nodes(positions)
         arms = positions[near] - positions.new_tensor(element.holds[hold].center)
-        fields = torch.stack([_rigid_rows(arms, column) for column in range(6)])  # (6, P, 3)
+        fields = rigid_fields(arms)
         solution = torch.linalg.lstsq(fields.flatten(1).T, element.nodal[:, near].flatten(1).T.to(fields)).solution
         found.append(solution.T)
     return torch.stack(found, dim=1)
-
-
-def _rigid_rows(arms: Tensor, column: int) -> Tensor:
-    axis = torch.eye(3, dtype=arms.dtype)[column % 3].expand_as(arms)
-    return axis if column < 3 else torch.linalg.cross(axis, arms)
 
 
 def _rigid(center: Tensor) -> Tensor:
