@@ -72,6 +72,18 @@ def torsion_constant(wide: float, thick: float) -> float:
     return wide * thick**3 / 3 * (1 - 192 * thick / (math.pi**5 * wide) * series)
 
 
+def shear_of_torsion(x: float, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Across the width and through the thickness, N/mm^2, at a place of a section twisted by 1 N mm (Saint-Venant)."""
+    across, through = torch.zeros_like(y), torch.zeros_like(y)
+    for n in range(1, 60, 2):
+        k, sign = n * math.pi / THICK, (-1) ** ((n - 1) // 2)
+        inside, edge = math.cosh(k * x) / math.cosh(k * WIDE / 2), math.sinh(k * x) / math.cosh(k * WIDE / 2)
+        across -= sign / n**2 * (1 - inside) * torch.sin(k * y)
+        through += sign / n**2 * edge * torch.cos(k * y)
+    scale = 8 * THICK / math.pi**2 / torsion_constant(WIDE, THICK)
+    return scale * across, scale * through
+
+
 def test_a_bar_bends_twists_and_stretches_as_beam_theory_says(bar: Bar) -> None:
     flat, edge = WIDE * THICK**3 / 12, THICK * WIDE**3 / 12
     assert bar.rate(bar.bent("moment", 0), 1, 2) * E * flat == pytest.approx(1.0, rel=0.01)
@@ -89,6 +101,19 @@ def test_stresses_are_those_of_beam_theory(bar: Bar) -> None:
     sign = torch.sign((stress[:, 2, 2] * expected).sum())
     torch.testing.assert_close(sign * stress[:, 2, 2], expected, atol=0.07 * largest, rtol=0)
     torch.testing.assert_close(von_mises(stress), expected.abs(), atol=0.07 * largest, rtol=0)
+
+
+def test_shear_of_a_twisted_bar_is_that_of_saint_venant(bar: Bar) -> None:
+    nodal = bar.body.response(*([part] for part in bar.load("moment", 2)))
+    y = torch.linspace(-THICK / 2, THICK / 2, 9, dtype=torch.float64)
+    for x, bound in ((0.0, 0.02), (WIDE / 4, 0.03), (WIDE / 2, 0.15)):
+        places = torch.stack([torch.full_like(y, x), y, torch.zeros_like(y)], dim=-1) @ bar.turn.T
+        stress = bar.turn.T @ bar.body.stress(places, nodal)[0] @ bar.turn
+        across, through = shear_of_torsion(x, y)
+        sign = torch.sign((stress[:, 0, 2] * across + stress[:, 1, 2] * through).sum())
+        largest = float(shear_of_torsion(0.0, y)[0].abs().max())
+        for found, expected in ((stress[:, 0, 2], across), (stress[:, 1, 2], through)):
+            torch.testing.assert_close(sign * found, expected, atol=bound * largest, rtol=0)
 
 
 def test_the_body_does_not_move_as_a_whole_and_loads_left_over_are_carried_evenly(bar: Bar) -> None:

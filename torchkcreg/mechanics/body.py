@@ -15,7 +15,7 @@ from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for, interpolated
 from torchkcreg.mechanics.rigid import rigid_fields
 from torchkcreg.mechanics.stiffness import stiffness_matrix
-from torchkcreg.mechanics.stress import stresses, volumes_in_cubes
+from torchkcreg.mechanics.stress import StressField, volumes_in_cubes
 from torchkcreg.physics import ElasticConstants
 
 _INERTIA_PITCH_MM = 1.0  # what is left over of loads is carried evenly; any even distribution will do
@@ -93,8 +93,8 @@ class ElasticBody:
         return interpolated(self.hexahedra, nodal, *self.hexahedra.locate(points))
 
     def stress(self, points: Tensor, nodal: Tensor) -> Tensor:
-        """Stresses (L, P, 3, 3) at points of the implant, N/mm^2, in its axes; see `stresses`."""
-        return stresses(self.hexahedra, self.filled, self.constants, points, nodal)
+        """Stresses (L, P, 3, 3) at points of the implant, N/mm^2, in its axes; see `StressField`."""
+        return StressField.of(self.hexahedra, self.filled, self.constants, nodal).at(points)
 
 
 def _pinned(positions: Tensor) -> list[int]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchkcreg.mechanics.expected_loads import ExpectedLoads
 from torchkcreg.mechanics.sections import Sections
-from torchkcreg.mechanics.stress import stresses, von_mises
+from torchkcreg.mechanics.stress import StressField, deviator, von_mises
 from torchkcreg.mechanics.superelement import Superelement
 
 _SECTIONS = 121
@@ -106,15 +106,13 @@ def node_stresses(element: Superelement, points: Tensor, amounts: Tensor, covari
         amounts: Of its ways to bend, (A,), mm.
         covariance: Of them, (A, A), mm^2.
     """
+    field = StressField.of(element.hexahedra, element.filled, element.constants, element.nodal)
     found, deviations = [], []
     for some in points.double().split(_AT_ONCE):
-        ways = stresses(element.hexahedra, element.filled, element.constants, some, element.nodal)
+        ways = field.at(some)
         total = torch.einsum("a,apij->pij", amounts, ways)
         value = von_mises(total)
-        deviator = total - total.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(
-            3, dtype=total.dtype, device=total.device
-        )
-        slope = torch.einsum("pij,apij->pa", deviator, ways) * (1.5 / value.clamp_min(1e-9))[:, None]
+        slope = torch.einsum("pij,apij->pa", deviator(total), ways) * (1.5 / value.clamp_min(1e-9))[:, None]
         found.append(value)
         deviations.append(torch.einsum("pa,ab,pb->p", slope, covariance, slope).clamp_min(0).sqrt())
     return torch.cat(found), torch.cat(deviations)

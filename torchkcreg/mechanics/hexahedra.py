@@ -92,6 +92,15 @@ class Hexahedra:
         inside = 2 * (local / self.edge - self.cells[cube]) - 1
         return cube, inside
 
+    def neighbours(self, axis: int, step: int) -> Tensor:
+        """Number of the cube (E,) so many steps along an axis from each, -1 where there is none."""
+        cells = self.cells.clone()
+        cells[:, axis] += step
+        size = self.number_of.shape[axis]
+        there = (cells[:, axis] >= 0) & (cells[:, axis] < size)
+        cells[:, axis].clamp_(0, size - 1)
+        return torch.where(there, self.number_of[tuple(cells.unbind(-1))], -1)
+
     def shape_functions(self, inside: Tensor) -> tuple[Tensor, Tensor]:
         """Values (P, 27) and gradients (P, 27, 3), 1/mm in the lattice's frame, at places (P, 3) inside cubes."""
         values, slopes = _quadratics(inside), _quadratic_slopes(inside) * (2 / self.edge)

@@ -14,7 +14,7 @@ from torchkcreg.mechanics.body import ElasticBody
 from torchkcreg.mechanics.hexahedra import Hexahedra, interpolated
 from torchkcreg.mechanics.holds import Hold, unit_loads
 from torchkcreg.mechanics.sections import Sections
-from torchkcreg.mechanics.stress import stresses
+from torchkcreg.mechanics.stress import StressField
 from torchkcreg.physics import ElasticConstants
 from torchkcreg.plain import require_keys
 
@@ -154,7 +154,7 @@ class Superelement:
     def stress(self, points: Tensor, amounts: Tensor) -> Tensor:
         """Stresses (P, 3, 3) at points (P, 3) of the undeformed implant, N/mm^2, in its axes."""
         nodal = torch.einsum("a,ani->ni", amounts.to(self.nodal), self.nodal)[None]
-        return stresses(self.hexahedra, self.filled, self.constants, points, nodal)[0]
+        return StressField.of(self.hexahedra, self.filled, self.constants, nodal).at(points)[0]
 
     def to(self, device: torch.device | str) -> Superelement:
         """On a device."""
