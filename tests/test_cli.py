@@ -14,7 +14,7 @@ from torchkcreg.io import read_components, read_geometry, read_points, read_proj
 
 FIGURES = {"overlay.png", "displacement.png", "history.png"}
 RUN_FILES = {"config.yaml", "versions.json", "checkpoint.pt", "history.json", "metrics.json", "deformation.json"}
-EXPORTS = {"dvf.mha", "bspline.tfm", "implant_deformed.ply"}
+EXPORTS = {"dvf.mha", "bspline.tfm", "implant_deformed.ply", "arrays.npz", "uncertainty.json"}
 
 
 def command(case, out, **changes):
@@ -83,8 +83,10 @@ def test_warp_flags_points_beyond_the_implant(finished, tmp_path, capsys):
         main(["warp", f"--run={finished}", f"--points={tmp_path / 'points.csv'}", f"--out={tmp_path / 'w.csv'}"]) == 0
     )
     lines = (tmp_path / "w.csv").read_text().splitlines()
-    assert lines[0] == "x,y,z,outside"
-    assert [line.rsplit(",", 1)[1] for line in lines[1:]] == ["0", "1"]
+    assert lines[0] == "x,y,z,outside,lateral_std_mm,depth_std_mm"
+    near, far = ([float(cell) for cell in line.split(",")] for line in lines[1:])
+    assert [near[3], far[3]] == [0, 1]
+    assert 0 < near[4] < far[4] and 0 < near[5] < far[5]  # a rotation that is off grows with the distance
     assert "1 of 2 points lie beyond the implant's reach" in capsys.readouterr().err
 
 

@@ -101,12 +101,13 @@ def test_a_mesh_is_not_written_under_an_unknown_suffix(tmp_path, plate):
 def test_a_cloud_with_displacements_is_a_ply_that_others_read(tmp_path):
     points = torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
     displacement = torch.tensor([[3.0, 0.0, 4.0]]).expand(100, 3)
-    write_point_cloud_ply(tmp_path / "cloud.ply", points, displacement)
+    write_point_cloud_ply(tmp_path / "cloud.ply", points, displacement, torch.linspace(0, 1, 100))
     cloud = trimesh.load(tmp_path / "cloud.ply")
     assert np.allclose(cloud.vertices, points.numpy())
     fields = cloud.metadata["_ply_raw"]["vertex"]["data"]
     assert np.array_equal(fields["dz"].ravel(), np.full(100, 4, np.float32))
     assert fields["displacement"].ravel() == pytest.approx(5.0)
+    assert fields["std"].ravel() == pytest.approx(np.linspace(0, 1, 100), abs=1e-6)
 
 
 def test_a_cloud_that_is_none_is_not_written(tmp_path):
@@ -114,4 +115,6 @@ def test_a_cloud_that_is_none_is_not_written(tmp_path):
         write_point_cloud_ply(tmp_path / "c.ply", torch.zeros(0, 3))
     with pytest.raises(ValueError, match="displacement must have shape"):
         write_point_cloud_ply(tmp_path / "c.ply", torch.zeros(2, 3), torch.zeros(3, 3))
+    with pytest.raises(ValueError, match="std must have shape"):
+        write_point_cloud_ply(tmp_path / "c.ply", torch.zeros(2, 3), None, torch.zeros(3))
     assert list(tmp_path.iterdir()) == []

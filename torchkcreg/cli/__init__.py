@@ -60,7 +60,9 @@ def _add_warp(commands) -> None:
     command = add_command(commands, "warp", _warp, "move points of the undeformed implant's frame to the world")
     command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
     command.add_argument("--points", type=Path, required=True, help="x,y,z in the implant's frame, mm (CSV)")
-    command.add_argument("--out", type=Path, required=True, help="CSV to write: x,y,z in the world, outside or not")
+    command.add_argument(
+        "--out", type=Path, required=True, help="CSV to write: x,y,z in the world, outside or not, deviations"
+    )
     command.add_argument("--implant-name", help="of several implants, the one whose frame the points are in (its file)")
 
 
@@ -79,7 +81,10 @@ def _warp(options: argparse.Namespace) -> None:
             "they move rigidly with its nearest part",
             stacklevel=1,
         )
-    write_points(options.out, implant.warp(points), outside=outside)
+    columns = {"outside": outside}
+    if implant.deviations is not None:
+        columns |= dict(zip(("lateral_std_mm", "depth_std_mm"), implant.deviations.split(points), strict=True))
+    write_points(options.out, implant.warp(points), **columns)
 
 
 def _add_evaluate(commands) -> None:

@@ -3,6 +3,7 @@ A free-form deformation has groups of control points that move rigidly or along 
 points are in the grid's axes, points and fields in the implant's frame."""
 
 from torchkcreg.deformation.clustering import cluster_control_points, control_point_volumes
+from torchkcreg.deformation.deviations import Deviation, Deviations, depth_direction
 from torchkcreg.deformation.elasticity import Elasticity
 from torchkcreg.deformation.ffd import FreeFormDeformation
 from torchkcreg.deformation.finite_elements import FiniteElementDeformation, FiniteElementMotion
@@ -27,6 +28,8 @@ from torchkcreg.deformation.strain import strain_energy
 __all__ = [
     "BendingPrior",
     "Deformation",
+    "Deviation",
+    "Deviations",
     "Elasticity",
     "FiniteElementDeformation",
     "FiniteElementMotion",
@@ -43,6 +46,7 @@ __all__ = [
     "control_point_volumes",
     "control_points_from_groups",
     "deformation_from_dict",
+    "depth_direction",
     "diffusion_penalty",
     "group_centers",
     "group_moment_gradients",

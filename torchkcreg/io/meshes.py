@@ -63,13 +63,16 @@ def write_mesh(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:
         mesh.export(str(temporary), file_type=suffix[1:])
 
 
-def write_point_cloud_ply(path: str | os.PathLike[str], points: Tensor, displacement: Tensor | None = None) -> None:
+def write_point_cloud_ply(
+    path: str | os.PathLike[str], points: Tensor, displacement: Tensor | None = None, std: Tensor | None = None
+) -> None:
     """Nothing; writes points as a binary PLY that ParaView, MeshLab, CloudCompare and 3D Slicer open.
 
     Args:
         path: the file.
         points: (N, 3) in mm.
         displacement: (N, 3) in mm, becomes the vertex fields `dx`, `dy`, `dz` and its length `displacement`.
+        std: expected error of each (N,), mm, becomes `std`.
 
     Raises:
         ValueError: shapes don't fit, or there is no point.
@@ -82,6 +85,10 @@ def write_point_cloud_ply(path: str | os.PathLike[str], points: Tensor, displace
             raise ValueError(f"displacement must have shape {tuple(points.shape)}, got {tuple(displacement.shape)}")
         columns |= {f"d{name}": displacement[:, i] for i, name in enumerate("xyz")}
         columns["displacement"] = torch.linalg.vector_norm(displacement, dim=-1)
+    if std is not None:
+        if std.shape != points.shape[:1]:
+            raise ValueError(f"std must have shape ({len(points)},), got {tuple(std.shape)}")
+        columns["std"] = std
     table = np.empty(len(points), dtype=[(name, "<f4") for name in columns])
     for name, column in columns.items():
         table[name] = column.detach().cpu().numpy()

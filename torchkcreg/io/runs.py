@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 
 CONFIG, VERSIONS, HISTORY, METRICS = "config.yaml", "versions.json", "history.json", "metrics.json"
 DEFORMATION, FIELD, TRANSFORM, CLOUD = "deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply"
-CHECKPOINT, ARRAYS = "checkpoint.pt", "arrays.npz"
+CHECKPOINT, ARRAYS, UNCERTAINTY = "checkpoint.pt", "arrays.npz", "uncertainty.json"
 SEEDS = "seeds"
 FIGURES = ("overlay.png", "displacement.png", "history.png")
-RUN_FILES = (DEFORMATION, CONFIG, VERSIONS, HISTORY, METRICS, FIELD, TRANSFORM, CLOUD, CHECKPOINT, ARRAYS, *FIGURES)
+_RESULT_FILES = (DEFORMATION, METRICS, UNCERTAINTY, FIELD, TRANSFORM, CLOUD, ARRAYS)
+RUN_FILES = (CONFIG, VERSIONS, HISTORY, CHECKPOINT, *_RESULT_FILES, *FIGURES)
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
@@ -46,10 +47,11 @@ class RunFolder:
     | `history.json` | a record an iteration |
     | `metrics.json` | what was measured |
     | `deformation.json` | all parameters of the result; written last, so where it is the run is complete |
-    | `arrays.npz` | what of it is too long for JSON: of finite elements, how the implant responds to loads |
+    | `arrays.npz` | what of it is too long for JSON: how an implant may be off, and responds to loads |
+    | `uncertainty.json` | expected errors, see `uncertainty_of` |
     | `dvf.mha` | displacement field, see `displacement_field` |
     | `bspline.tfm` | ITK transform, see `itk_transform` |
-    | `implant_deformed.ply` | the deformed point cloud with the displacement of each node |
+    | `implant_deformed.ply` | the deformed point cloud with the displacement and the expected error of each node |
     | `overlay.png`, `displacement.png`, `history.png` | figures |
     | `seeds/<seed>/` | a run folder of each seed, where several were run |
 
@@ -169,7 +171,10 @@ class RunFolder:
             write_displacement_field(self.path / f"{prefix}{FIELD}", pose, deformation, nodes)
             if isinstance(deformation, SplineField):
                 write_itk_transform(self.path / f"{prefix}{TRANSFORM}", pose, deformation)
-            write_point_cloud_ply(self.path / f"{prefix}{CLOUD}", moved, displacement)
+            std = None if implant.deviations is None else implant.deviations.of_nearest(nodes)
+            write_point_cloud_ply(self.path / f"{prefix}{CLOUD}", moved, displacement, std)
+        if any(implant.deviations is not None for implant in result.implants):
+            write_json(self.path / UNCERTAINTY, uncertainty_of(result))
         if arrays:
             write_arrays(self.path / ARRAYS, arrays)
         write_json(self.path / DEFORMATION, content, indent=None)
@@ -205,6 +210,17 @@ class RunFolder:
         for emptied in (*folder.glob("*/"), folder):
             if emptied.is_dir() and not any(emptied.iterdir()):
                 emptied.rmdir()
+
+
+def uncertainty_of(result: RegistrationResult) -> dict[str, Any]:
+    """Expected errors of a registration: of its nodes as a whole, and of each implant across and along the rays, mm."""
+    implants = {}
+    for implant in result.implants:
+        if implant.deviations is not None:
+            whole, lateral, depth = implant.deviations.rms
+            directions = {"lateral_std_mm": lateral, "depth_std_mm": depth, "depth": implant.deviations.depth}
+            implants[implant.name] = {"node_std_mm": whole, **directions}
+    return plain({"node_std_mm": result.diagnostics.get("node_std_mm"), "implants": implants})
 
 
 def read_run(path: str | os.PathLike[str]) -> RegistrationResult:

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchkcreg.deformation import Deviations, depth_direction
 from torchkcreg.scene import Assembly
 
 from .objective import Objective
 from .verdict import Diagnostics, Rival
 
-_DIFFERENCE_MM = 0.01
 _AT_BOUND = 0.01  # of a parameter's range
 _NODES_PITCH_MM = 2.0
 
@@ -38,8 +38,8 @@ def diagnose(
     converged: bool,
     undone: Mapping[str, str],
     rival: Rival | None,
-) -> Diagnostics:
-    """What is measured of a scene at the end of its registration; of several implants, the worst.
+) -> tuple[Diagnostics, list[Deviations]]:
+    """What is measured of a scene at the end of its registration, of several implants the worst; how each may be off.
 
     Deformations that want to know how sure they are, are told.
 
@@ -52,13 +52,12 @@ def diagnose(
     """
     rest, scene = objective.at_rest, objective.scene
     known = objective.uncertainty(rest[0])
-    covariance = known.covariance
-    objective.moves.keep_covariance(covariance)
+    deviations = deviations_of(objective, known.covariance)
     seen = [seen_shares(assembly, objective) for assembly in scene]
-    return Diagnostics(
+    found = Diagnostics(
         gc=gc,
         misfit=1 - float(objective.similarities(rest).mean()),
-        node_std_mm=node_deviation(objective, rest[0], covariance),
+        node_std_mm=max(implant.rms.whole for implant in deviations),
         surprise=max(assembly.deformation.surprise() for assembly in scene),
         effective_parameters=known.effective_parameters,
         blocks=known.blocks,
@@ -71,6 +70,7 @@ def diagnose(
         rival=rival,
         screws_found=sum(len(assembly.found) for assembly in scene),
     )
+    return found, deviations
 
 
 def _folds(assembly: Assembly) -> bool:
@@ -79,14 +79,11 @@ def _folds(assembly: Assembly) -> bool:
 
 
 @torch.no_grad()
-def node_deviation(objective: Objective, parameters: Tensor, covariance: Tensor) -> float:
-    """Expected root mean square error of the implant's nodes for the parameters' covariance (D, D), mm."""
-    moves = _node_moves(objective, parameters)
-    return float(torch.einsum("sd,de,se->", moves, covariance, moves).clamp_min(0).sqrt())
-
-
-def _node_moves(objective: Objective, parameters: Tensor) -> Tensor:
-    """Derivatives (S, D) of the nodes' displacements, weighted so that their squares sum to the mean square."""
-    offsets = _DIFFERENCE_MM * torch.eye(len(parameters), dtype=parameters.dtype, device=parameters.device)
-    ahead, behind = (objective.moves.displacements(parameters + s * offsets) for s in (1, -1))
-    return ((ahead - behind) / (2 * _DIFFERENCE_MM)).T
+def deviations_of(objective: Objective, covariance: Tensor) -> list[Deviations]:
+    """How far each implant may be off, for the covariance (D, D) of all parameters."""
+    found = []
+    for number, own in enumerate(objective.moves.keep_covariance(covariance)):
+        nodes = objective.scene.assemblies[number].nodes()
+        depth = depth_direction(objective.images.geometry.source_positions.to(nodes), nodes.mean(0))
+        found.append(Deviations.of(*objective.moves.slopes(number), own, depth))
+    return found

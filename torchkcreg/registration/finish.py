@@ -38,13 +38,16 @@ def finished(
     gc = similarities(run, GradientCorrelation)  # in which every pixel counts alike
     coarse = _diagnosed(run, data)
     converged = _converged(history, last) and stopped is None
-    found = diagnose(coarse.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
+    found, deviations = diagnose(coarse.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
     status, reasons = judge(found)
     if stopped is not None:
         reasons = [*reasons, f"the registration was ended before its time: {stopped}"]
         status = "doubtful" if status == "ok" else status
     return RegistrationResult(
-        implants=[RegisteredImplant.of(assembly, has_material=config.material is not None) for assembly in scene],
+        implants=[
+            RegisteredImplant.of(assembly, has_material=config.material is not None, deviations=own)
+            for assembly, own in zip(scene, deviations, strict=True)
+        ],
         gc=gc,
         history=list(history),
         stages=list(records),

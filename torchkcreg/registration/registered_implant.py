@@ -10,7 +10,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.deformation import Deformation, deformation_from_dict
+from torchkcreg.deformation import Deformation, Deviations, deformation_from_dict
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import ImplantPointCloud, Screw, deformed_surface
 from torchkcreg.plain import finite_array, require_keys
@@ -34,6 +34,7 @@ class RegisteredImplant:
         found: Names of the screws that were found, not given.
         follow_radius_mm: How near to a component's head the implant's nodes tell its motion, mm.
         cloud: The undeformed implant's nodes; None where the result was read from a run folder.
+        deviations: How far it may be off; None where nobody knows.
     """
 
     name: str
@@ -45,9 +46,12 @@ class RegisteredImplant:
     found: list[str] = field(default_factory=list)
     follow_radius_mm: float = 8.0
     cloud: ImplantPointCloud | None = field(default=None, repr=False)
+    deviations: Deviations | None = field(default=None, repr=False)
 
     @classmethod
-    def of(cls, assembly: Assembly, *, has_material: bool = True) -> RegisteredImplant:
+    def of(
+        cls, assembly: Assembly, *, has_material: bool = True, deviations: Deviations | None = None
+    ) -> RegisteredImplant:
         """An assembly as it is now."""
         return cls(
             name=assembly.name,
@@ -59,6 +63,7 @@ class RegisteredImplant:
             found=[screw.name for screw in assembly.found],
             follow_radius_mm=assembly.follow_radius_mm,
             cloud=assembly.implant,
+            deviations=deviations,
         )
 
     def to(self, device: torch.device | str) -> RegisteredImplant:
@@ -69,6 +74,7 @@ class RegisteredImplant:
             deformation=self.deformation.to(device),
             components={name: motion.to(device) for name, motion in self.components.items()},
             cloud=None if self.cloud is None else self.cloud.to(device),
+            deviations=None if self.deviations is None else self.deviations.to(device),
         )
 
     @torch.no_grad()
@@ -168,6 +174,7 @@ class RegisteredImplant:
             "screws": [screw.to_dict() for screw in self.screws],
             "found": list(self.found),
             "follow_radius_mm": self.follow_radius_mm,
+            "deviations": None if self.deviations is None else self.deviations.to_dict(),
         }
 
     @classmethod
@@ -194,4 +201,5 @@ class RegisteredImplant:
             screws=screws,
             found=[str(name) for name in content.get("found", [])],
             follow_radius_mm=float(content.get("follow_radius_mm", 8.0)),
+            deviations=Deviations.from_dict(known) if (known := content.get("deviations")) is not None else None,
         )

@@ -24,6 +24,7 @@ from .view import View
 _SCREW_PITCH_MM = 0.5
 _DIFFERENCE_MM = 1e-3
 _NODES_PITCH_MM = 2.0  # distances between candidates need no finer nodes
+_DEVIATIONS_PITCH_MM = 3.0
 
 
 class Moves(ParameterBlocks):
@@ -98,15 +99,27 @@ class Moves(ParameterBlocks):
         steps[name] = torch.linalg.lstsq(slopes.T, wanted[:, None]).solution[:, 0]
         return torch.cat(list(steps.values()))
 
-    def keep_covariance(self, covariance: Tensor) -> None:
-        """Tells each motion the covariance of its steps, out of that of all parameters (D, D)."""
-        start = 0
+    @torch.no_grad()
+    def slopes(self, number: int) -> tuple[Tensor, Tensor]:
+        """Nodes (N, 3) of an assembly, by its number, and how far a unit of each step of its motion moves them.
+
+        Steps from rest, in the world's axes: (D, N, 3).
+        """
+        motion, pose = self.parts[number].bound.motion, self.parts[number].bound.pose
+        points = self.parts[number].assembly.implant.coarsened_to(_DEVIATIONS_PITCH_MM).points.double()
+        offsets = _DIFFERENCE_MM * torch.eye(motion.num_parameters, dtype=torch.float64, device=points.device)
+        change = motion.coefficients(offsets) - motion.coefficients(-offsets)
+        return points, motion.features(points) @ (change / (2 * _DIFFERENCE_MM)) @ pose[:3, :3].mT
+
+    def keep_covariance(self, covariance: Tensor) -> list[Tensor]:
+        """Tells each motion the covariance of its steps, out of that of all parameters (D, D), and returns them."""
+        places, start = {}, 0
         for name, block in self.items():
-            end = start + block.num_parameters
-            for part in self.parts:
-                if name == f"motion of {part.name}":
-                    part.bound.motion.keep_covariance(covariance[start:end, start:end])
-            start = end
+            places[name] = slice(start, start := start + block.num_parameters)
+        own = [covariance[places[f"motion of {part.name}"]][:, places[f"motion of {part.name}"]] for part in self.parts]
+        for part, known in zip(self.parts, own, strict=True):
+            part.bound.motion.keep_covariance(known)
+        return own
 
     @torch.no_grad()
     def accept(self, parameters: Tensor) -> None:
