@@ -90,6 +90,29 @@ def test_warp_flags_points_beyond_the_implant(finished, tmp_path, capsys):
     assert "1 of 2 points lie beyond the implant's reach" in capsys.readouterr().err
 
 
+def test_compare_of_a_run_with_itself_finds_no_motion_and_writes_table_and_figure(finished, tmp_path, capsys):
+    flags = ["--loads", "100", "200", f"--out={tmp_path / 'c'}"]
+    assert main(["compare", str(finished), str(finished), str(finished), *flags]) == 0
+    assert {entry.name for entry in (tmp_path / "c").iterdir()} == {"compare.json", "compare.csv", "compare.png"}
+    content = json.loads((tmp_path / "c" / "compare.json").read_text())
+    first = content["runs"][0]
+    assert max(map(abs, first["rotation_deg"] + first["translation_mm"])) < 1e-6
+    assert min(first["rotation_std_deg"] + first["translation_std_mm"]) > 0
+    assert content["compliance_per_n"]["rotation_across_deg"]["std"] > 0
+    assert "degrees per kN" in capsys.readouterr().out
+    heads, *rows = (tmp_path / "c" / "compare.csv").read_text().splitlines()
+    assert heads.startswith("run,load_n,rotation_across_deg,rotation_across_std_deg,") and len(rows) == 2
+
+
+def test_compare_refuses_what_cannot_be_told(finished, capsys):
+    assert main(["compare", str(finished), str(finished), "--loads", "1", "2"]) == 2
+    assert "1 loaded runs need as many loads, got 2" in the_error(capsys, "compare")
+    assert main(["compare", str(finished), str(finished), "--plane", "0", "0", "500"]) == 2
+    assert "say where the fracture is by a plane" in the_error(capsys, "compare")
+    assert main(["compare", str(finished), str(finished), "--plane", "0", "0"]) == 2
+    assert "3 or 6 numbers, got 2" in the_error(capsys, "compare")
+
+
 def test_evaluate_prints_and_writes_the_error(small_case, finished, tmp_path, capsys):
     points, truth = small_case / "before.csv", small_case / "after.csv"
     flags = [f"--run={finished}", f"--points={points}", f"--truth={truth}", f"--out={tmp_path / 'e.json'}"]

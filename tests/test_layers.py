@@ -28,9 +28,9 @@ FLOORS = {
     "simulation": 6,
     "io": 7,
     "evaluation": 7,
-    "visualization": 7,
-    "experiments": 8,
-    "cli": 9,
+    "visualization": 8,
+    "experiments": 9,
+    "cli": 10,
 }
 MOST_LEVELS = 6
 FOLDERS = sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file())

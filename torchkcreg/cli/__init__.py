@@ -1,4 +1,4 @@
-"""The command line: ``torchkcreg register | warp | evaluate | load | reconstruct | info | demo``."""
+"""The command line: ``torchkcreg register | warp | evaluate | load | compare | reconstruct | info | demo``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import torchkcreg
 from torchkcreg.console import one_line, run_command
 
 from .command import add_command
+from .compare import add_compare
 from .load import add_load
 from .register import add_register
 
@@ -50,6 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_warp(commands)
     _add_evaluate(commands)
     add_load(commands)
+    add_compare(commands)
     _add_reconstruct(commands)
     _add_info(commands)
     _add_demo(commands)

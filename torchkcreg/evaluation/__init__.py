@@ -1,20 +1,25 @@
 """How good a registration is, and what it measured: errors at reference points and of the shape, displacement maps."""
 
-from .alignment import align_to_surface, rigid_coherent_point_drift
+from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
 from .beads import Beads, find_beads
 from .displacement import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
+from .fragments import Fragments, fragments_of
 from .points import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
 from .regions import RegionStatistics, cylinder_region, distance_to, region_statistics
+from .relative_motion import AXES, RelativeMotion, relative_motion
 from .shape import ShapeEvaluation, evaluate_shape
 from .statistics import DistanceStatistics, distance_statistics, full_width_at_half_maximum
 
 __all__ = [
+    "AXES",
     "Beads",
     "DisplacementMap",
     "DistanceStatistics",
+    "Fragments",
     "PointMetrics",
     "RegionStatistics",
+    "RelativeMotion",
     "ShapeEvaluation",
     "align_to_surface",
     "bb_rmse",
@@ -26,11 +31,14 @@ __all__ = [
     "evaluate_points",
     "evaluate_shape",
     "find_beads",
+    "fragments_of",
+    "frame_changes",
     "full_width_at_half_maximum",
     "nearest_node_distances",
     "nearest_node_floor",
     "point_errors",
     "region_statistics",
+    "relative_motion",
     "rigid_coherent_point_drift",
     "surface_distances",
 ]

@@ -8,7 +8,7 @@ import trimesh
 from pycpd import RigidRegistration
 from torch import Tensor
 
-from torchkcreg.geometry import rigid_matrix, transform_points
+from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
 
 from .distances import closest_on_surface, finite_cloud
 
@@ -166,3 +166,37 @@ def _principal_frame(points: Tensor) -> tuple[Tensor, Tensor]:
     axes = torch.linalg.eigh((points - center).mT @ (points - center)).eigenvectors
     axes[:, 0] *= torch.linalg.det(axes).sign()
     return center, axes
+
+
+def frame_changes(mesh: trimesh.Trimesh, other: trimesh.Trimesh, *, tolerance_mm: float = 0.1) -> list[Tensor]:
+    """Rigid motions (4, 4) from the frame of a mesh to that of the same body in another frame.
+
+    One where the two have the same vertices in the same order; else all that lay the surfaces onto each other: of a
+    symmetric body several.
+
+    Args:
+        mesh: A closed surface, mm.
+        other: The body in another frame, perhaps meshed otherwise.
+        tolerance_mm: Root mean square distance that surfaces of one body may have.
+
+    Raises:
+        ValueError: If the two are not the same body.
+    """
+    points, targets = (torch.from_numpy(np.array(m.vertices, dtype=np.float64)) for m in (mesh, other))
+    if points.shape == targets.shape:
+        motion = fit_rigid(points, targets)
+        if float((transform_points(motion, points) - targets).norm(dim=-1).max()) < tolerance_mm:
+            return [motion]
+    samples = torch.from_numpy(np.array(trimesh.sample.sample_surface(mesh, _SURFACE_POINTS, seed=0)[0]))
+    onto = torch.from_numpy(np.array(trimesh.sample.sample_surface(other, _SURFACE_POINTS, seed=0)[0]))
+    found, nearest = [], float("inf")
+    for start in principal_motions(samples, onto):
+        motion = align_to_surface(transform_points(start, samples), other) @ start
+        _, distance, _ = closest_on_surface(transform_points(motion, samples), other)
+        off = float(distance.square().mean().sqrt())
+        nearest = min(nearest, off)
+        if off < tolerance_mm:
+            found.append(motion)
+    if not found:
+        raise ValueError(f"the two meshes are not of the same implant: their surfaces are {nearest:.2f} mm apart (RMS)")
+    return found

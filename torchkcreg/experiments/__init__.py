@@ -1,6 +1,7 @@
 """Whole experiments: register from files to a run folder, simulate and register a demo, say what a file holds."""
 
 from torchkcreg.experiments.capture import CaptureStudy, CaptureTrial, capture_study
+from torchkcreg.experiments.compare_files import Comparison, compare_files
 from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.describe import describe, describe_installation
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
@@ -16,6 +17,7 @@ from torchkcreg.experiments.seeds import SeedRuns, register_seeds
 __all__ = [
     "CaptureStudy",
     "CaptureTrial",
+    "Comparison",
     "FileEvaluation",
     "ImplantLoad",
     "ReconstructionFiles",
@@ -23,6 +25,7 @@ __all__ = [
     "RegistrationFiles",
     "SeedRuns",
     "capture_study",
+    "compare_files",
     "demo",
     "describe",
     "describe_installation",

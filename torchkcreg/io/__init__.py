@@ -7,7 +7,7 @@ what it writes is there whole or not at all.
 from .components import read_components, write_components
 from .config import read_config, write_config
 from .figures import write_figure
-from .files import read_json, write_json
+from .files import read_json, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .init import read_init, write_init
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
@@ -57,5 +57,6 @@ __all__ = [
     "write_projections",
     "write_spectrum",
     "write_surface_vtu",
+    "write_text",
     "write_volume",
 ]

@@ -1,0 +1,58 @@
+"""How an implant moved under load, as a figure: deflection along it, and its fragments' motion over the load."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from torchkcreg.evaluation import AXES, RelativeMotion
+
+_COLOURS = dict(zip(AXES, ("#0072B2", "#E69F00", "#009E73"), strict=True))
+
+
+def comparison_figure(motions: Sequence[RelativeMotion], names: Sequence[str], loads: Sequence[float] = ()) -> Figure:
+    """A figure of deflections against the lower fragment, with bands of one standard deviation; with loads also curves.
+
+    Args:
+        motions: Of the upper fragment, one a loaded run.
+        names: Of the runs.
+        loads: N, one a run; a figure without curves if empty.
+    """
+    figure = Figure(figsize=(9.5, 6.4 if loads else 4.6), layout="constrained", facecolor="white")
+    parts: Any = figure.subfigures(2, 1, height_ratios=[3, 2]) if loads else [figure]
+    panels = parts[0].subplots(3, 1, sharex=True)
+    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(motions)))
+    for row, (panel, axis) in enumerate(zip(panels, AXES, strict=True)):
+        for motion, name, shade in zip(motions, names, shades, strict=True):
+            height, value, std = (
+                x.cpu().numpy()
+                for x in (motion.heights, motion.deflection_mm[:, row], motion.deflection_std_mm[:, row])
+            )
+            panel.fill_between(height, value - std, value + std, color=shade, alpha=0.25, linewidth=0)
+            panel.plot(height, value, color=shade, label=name)
+        panel.axhline(0, color="0.6", linewidth=0.8, zorder=0)
+        panel.set_ylabel(f"{axis}\n(mm)")
+    panels[0].set_title("deflection along the implant against the lower fragment", fontsize=11)
+    panels[0].legend(frameon=False, fontsize=9, ncols=2)
+    panels[-1].set_xlabel("along the implant (mm)")
+    if loads:
+        _curves(parts[1], motions, loads)
+    for axes in figure.axes:
+        for edge in ("top", "right"):
+            axes.spines[edge].set_visible(False)
+    return figure
+
+
+def _curves(figure, motions: Sequence[RelativeMotion], loads: Sequence[float]) -> None:
+    turns, shifts = figure.subplots(1, 2)
+    for row, axis in enumerate(AXES):
+        for panel, part, unit in ((turns, 0, "degrees"), (shifts, 3, "mm")):
+            value, std = (np.array([float(m.numbers[k][part + row]) for m in motions]) for k in (0, 1))
+            panel.errorbar(loads, value, std, color=_COLOURS[axis], label=axis, marker="o", markersize=4, capsize=2)
+            panel.set_xlabel("load (N)")
+            panel.set_ylabel(f"{'rotation' if part == 0 else 'translation at the gap'} ({unit})")
+    turns.legend(frameon=False, fontsize=9)
