@@ -90,6 +90,25 @@ def test_warp_flags_points_beyond_the_implant(finished, tmp_path, capsys):
     assert "1 of 2 points lie beyond the implant's reach" in capsys.readouterr().err
 
 
+def test_a_registration_starts_from_an_earlier_one_of_the_same_implant(small_case, finished, tmp_path, capsys):
+    from torchkcreg.experiments import RegistrationFiles
+    from torchkcreg.experiments.inputs import read_inputs
+    from torchkcreg.registration import RegistrationConfig
+
+    names = {"geometry": small_case / "geometry.json", "projections": small_case / "projections.npz"}
+    files = RegistrationFiles(implant=small_case / "implant.stl", init=finished, **names)
+    (start,) = read_inputs(files, RegistrationConfig(pitch_mm=1.0)).starts
+    torch.testing.assert_close(start, read_run(finished).implant_to_world)
+    mesh = trimesh.load(small_case / "implant.stl")
+    mesh.apply_translation([0, 30, 0])
+    mesh.export(tmp_path / "elsewhere.stl")
+    rejected(
+        command(small_case, tmp_path / "run", implant=tmp_path / "elsewhere.stl", init=finished),
+        tmp_path / "run",
+        capsys,
+    )
+
+
 def test_compare_of_a_run_with_itself_finds_no_motion_and_writes_table_and_figure(finished, tmp_path, capsys):
     flags = ["--loads", "100", "200", f"--out={tmp_path / 'c'}"]
     assert main(["compare", str(finished), str(finished), str(finished), *flags]) == 0

@@ -24,7 +24,8 @@ def add_register(commands) -> None:
     command.add_argument("--spectrum", type=Path, help="detected spectrum: energy in keV, weight (CSV)")
     screws = "screws that move with the implant (JSON); - for none of one of several"
     command.add_argument("--components", type=_path_or_none, action="append", help=screws)
-    command.add_argument("--init", type=_path_or_none, action="append", help="approximate implant_to_world (JSON)")
+    start = "approximate implant_to_world (JSON), or the run folder of an earlier registration, such as without load"
+    command.add_argument("--init", type=_path_or_none, action="append", help=start)
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, where the file does not say it")
     command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
     command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import trimesh
 from torch import Tensor
@@ -22,6 +23,7 @@ from torchkcreg.io import (
     read_init,
     read_mesh,
     read_projections,
+    read_run,
     read_spectrum,
 )
 from torchkcreg.kernels import choose_backend
@@ -30,6 +32,7 @@ from torchkcreg.registration import Implant, RegistrationConfig
 from torchkcreg.scene import RegistrationData
 
 _FEWEST_NODES_ALONG = 4
+_SAME_FRAME_MM = 5.0  # by which bounds of one implant may differ: nodes do not reach its surface
 _FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
 
 
@@ -43,7 +46,7 @@ class RegistrationFiles:
         projections: Intensities or line integrals.
         spectrum: Detected spectrum; None takes a 90 kV tungsten spectrum where a material is named.
         components: Screws that move with the implant.
-        init: Approximate pose.
+        init: Approximate pose, or the run folder of another registration of the implant.
         materials: Of each of several implants, where they are not of one.
         views: Views to use; None takes all.
         open_beam: Unattenuated intensity where the projections' file does not say it.
@@ -151,8 +154,8 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
 
 def _read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
     screws = read_components(files.components) if files.components else []
-    pose = read_init(files.init) if files.init else None
     mesh = read_mesh(files.mesh)
+    pose = _start_pose(files, mesh)
     _check_size(files.mesh, mesh, config.pitch_mm)
     return Implant(
         ImplantPointCloud.from_mesh(mesh, config.pitch_mm),
@@ -162,6 +165,23 @@ def _read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
         material=files.material,
         name=files.name,
     )
+
+
+def _start_pose(files: ImplantFiles, mesh: trimesh.Trimesh) -> Tensor | None:
+    """A pose out of a file, or that of the same implant in the run folder of another registration."""
+    if files.init is None or not files.init.is_dir():
+        return read_init(files.init) if files.init else None
+    implants = read_run(files.init).implants
+    implant = next((i for i in implants if i.name == files.name), implants[0])
+    if implant.deviations is not None:
+        nodes, bounds = implant.deviations.points, torch.from_numpy(np.array(mesh.bounds))
+        off = float((torch.stack([nodes.amin(0), nodes.amax(0)]) - bounds).abs().max())
+        if off > _SAME_FRAME_MM:
+            raise ValueError(
+                f"the implant of run folder {files.init} reaches up to {off:.0f} mm further than {files.mesh}: another "
+                "implant, or another frame"
+            )
+    return implant.implant_to_world
 
 
 def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:
