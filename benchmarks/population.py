@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 import multiprocessing
 import os
 import time
@@ -39,10 +40,18 @@ from torchkcreg.experiments.capture import registration_inputs  # noqa: E402
 from torchkcreg.implant import find_holes  # noqa: E402
 from torchkcreg.mechanics import CarriedLoad  # noqa: E402
 from torchkcreg.physics import line_integrals_from_intensity  # noqa: E402
-from torchkcreg.registration import Callback, RegistrationConfig, RegistrationData, Trainer, build_scene  # noqa: E402
+from torchkcreg.registration import (  # noqa: E402
+    Callback,
+    RegisteredImplant,
+    RegistrationConfig,
+    RegistrationData,
+    Trainer,
+    build_scene,
+)
 from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case  # noqa: E402
 
 WRONG_MM, RIGHT_MM = 0.15, 0.10
+WIDTHS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.96, 2.25, 2.5, 2.75, 3.0, 3.5, 4.0)
 _MOMENTS = ("true", "found", "std")
 Job = tuple[int, str, bool, bool, dict[str, Any], str, str]
 
@@ -113,8 +122,46 @@ def register_case(
         "kind": f"{draw.material} {draw.screw_material} {draw.scanner} {draw.kvp} kV water {draw.water_radius:.0f}",
         "physics": " ".join(f"{name}={value:.3f}" for name, value in result.intensity.items()),
         "stages": " ".join(trace.errors),
+        "coverage": coverage_of(result.implants[0], case, nodes, errors),
         **load_errors(case, result.deformation),
     }
+
+
+def coverage_of(
+    implant: RegisteredImplant, case: SimulatedCase, nodes: torch.Tensor, errors: torch.Tensor
+) -> dict[str, list[float]]:
+    """Which share of true positions lies within so many stated deviations, for each of `WIDTHS`."""
+    known = implant.deviations
+    if known is None:
+        return {}
+    beads = case.beads_before.double()
+    off = {"nodes": (nodes, errors), "beads": (beads, implant.warp(beads) - case.beads_after.double())}
+    _, axes = torch.linalg.eigh(torch.outer(known.depth, known.depth))
+    first, second = axes[:, 0], axes[:, 1]
+    found = {}
+    for name, (points, error) in off.items():
+        spread = known.covariance(points)
+        for part, directions in (("lateral", (first, second)), ("depth", (known.depth,))):
+            sizes = [(error @ d).abs() / torch.einsum("i,nij,j->n", d, spread, d).sqrt() for d in directions]
+            size = torch.cat(sizes)
+            found[f"{name} {part}"] = [round(float((size <= width).double().mean()), 4) for width in WIDTHS]
+    return found
+
+
+def coverage_summary(rows: list[dict[str, Any]], path: Path) -> str:
+    """Shares within one and two deviations, averaged over cases; draws them for all widths."""
+    curves = {name: np.mean([row["coverage"][name] for row in rows], axis=0) for name in rows[0]["coverage"]}
+    figure, axis = plt.subplots(figsize=(5.2, 4.0), layout="constrained")
+    normal = [math.erf(width / math.sqrt(2)) for width in WIDTHS]
+    axis.plot(WIDTHS, normal, color="0.6", linestyle="--", label="normal distribution")
+    for (name, curve), colour in zip(curves.items(), ("#0072B2", "#56B4E9", "#D55E00", "#E69F00"), strict=True):
+        axis.plot(WIDTHS, curve, color=colour, label=name)
+    axis.set(xlabel="half width of the interval (stated standard deviations)", ylabel="share of true positions in it")
+    axis.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    told = (f"{name} {c[WIDTHS.index(1.0)]:.0%} / {c[WIDTHS.index(1.96)]:.0%}" for name, c in curves.items())
+    return f"within 68 % / 95 % intervals, {len(rows)} cases: {', '.join(told)}"
 
 
 def load_errors(case: SimulatedCase, deformation: Deformation) -> dict[str, Any]:
@@ -284,6 +331,8 @@ def main() -> None:
         draw_plot(rows, options.out / f"{name}.png")
         draw_verdict([row for row in rows if "node_std_mm" in row], options.out / f"{name}-verdict.png")
     print(summary(rows))
+    if covered := [row for row in rows if row.get("coverage")]:
+        print(coverage_summary(covered, options.out / f"{name}-coverage.png"))
     if loads := [row for row in rows if "gap_true" in row]:
         print(*(load_summary(loads, place) for place in ("gap", "largest")), sep="\n")
 

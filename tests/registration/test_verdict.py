@@ -6,7 +6,9 @@ import pytest
 import torch
 from small_scene import RIGID, SCREW, image, pose, scene
 
+from torchkcreg.parameters import ParameterBlock, ParameterBlocks
 from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, Trainer
+from torchkcreg.registration.uncertainty import Uncertainty, views_a_side
 from torchkcreg.registration.verdict import Diagnostics, Rival, judge
 from torchkcreg.scene.physics import PhysicsParameters
 
@@ -106,8 +108,48 @@ def test_a_bound_where_a_parameter_is_likely_to_be_says_nothing() -> None:
 
 
 def test_screws_that_were_found_ask_for_more() -> None:
-    same = replace(GOOD, node_std_mm=0.05)
+    same = replace(GOOD, node_std_mm=0.09)
     assert judge(same)[0] == "ok"
     status, (reason,) = judge(replace(same, screws_found=4))
     assert status == "doubtful"
     assert "4 screws that were found" in reason
+
+
+def test_views_from_one_side_count_as_one() -> None:
+    nodes = torch.cartesian_prod(*(torch.linspace(-x, x, 5).double() for x in (6.0, 2.0, 90.0)))
+
+    def sources(degrees: list[float], heights: list[float]) -> torch.Tensor:
+        angle, z = torch.deg2rad(torch.tensor(degrees)).double(), torch.tensor(heights).double()
+        return torch.stack([400 * angle.cos(), 400 * angle.sin(), z], dim=-1)
+
+    assert views_a_side(sources([90, 91, 92], [120.0, 0.0, -120.0]), nodes) == pytest.approx(3.0, abs=0.05)
+    assert views_a_side(sources([0, 60, 120], [120.0, 0.0, -120.0]), nodes) == pytest.approx(1.0, abs=0.01)
+    pairs = views_a_side(sources([0, 1, 90, 91], [0.0, 10.0, 0.0, 10.0]), nodes)
+    assert pairs == pytest.approx(2.0, abs=0.05)
+
+
+def test_blocks_of_one_side_and_found_screws_widen_the_covariance() -> None:
+    class Free(ParameterBlock):
+        num_parameters = 2
+
+    generator = torch.Generator().manual_seed(0)
+    jacobian = torch.randn(2, 3, 2, 48, 48, generator=generator, dtype=torch.float64)
+    residuals = torch.randn(3, 2, 48, 48, generator=generator, dtype=torch.float64)
+
+    def covariance(**known) -> torch.Tensor:
+        return Uncertainty.of(
+            jacobian,
+            residuals,
+            ParameterBlocks({"free": Free()}),
+            lambda p: p.new_zeros(len(p)),
+            torch.zeros(2).double(),
+            pixel_mm=1.0,
+            **known,
+        ).covariance
+
+    alone = covariance()
+    # white residuals of one: the variance of a least squares fit
+    flat = jacobian.flatten(1)
+    torch.testing.assert_close(alone, torch.linalg.inv(flat @ flat.T), rtol=0.35, atol=2e-5)
+    torch.testing.assert_close(covariance(views_a_side=3.0), 3 * alone)
+    torch.testing.assert_close(covariance(screws_found=True), 1.7**2 * alone)

@@ -11,7 +11,7 @@ from torchkcreg.scene import Moves, Scene, State, View
 from torchkcreg.similarity import Similarity, sobel_gradient
 
 from .robust import residual_weights
-from .uncertainty import Uncertainty
+from .uncertainty import Uncertainty, views_a_side
 
 Penalty = Callable[[State], Tensor]
 SimilarityFactory = Callable[[Tensor, Tensor | None, Tensor | None], Similarity]
@@ -115,7 +115,17 @@ class Objective:
         """How sure the images are of parameters (D,) near the optimum."""
         jacobian, residuals = self.jacobian(parameters)
         pixel = self.view.geometry.pixel_spacing[1]
-        return Uncertainty.of(jacobian, residuals, self.moves, self.penalty, parameters, pixel_mm=pixel)
+        first = self.scene.assemblies[0].nodes()
+        return Uncertainty.of(
+            jacobian,
+            residuals,
+            self.moves,
+            self.penalty,
+            parameters,
+            pixel_mm=pixel,
+            views_a_side=views_a_side(self.images.geometry.source_positions.to(first), first),
+            screws_found=any(assembly.found for assembly in self.scene),
+        )
 
     def _residuals(self, candidates: Tensor) -> Tensor:
         return self.similarity.residuals(self.line_integrals(candidates))

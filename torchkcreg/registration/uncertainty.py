@@ -12,6 +12,8 @@ from torchkcreg.parameters import ParameterBlocks
 
 _BLOCK_MM = 12.0  # on the detector: residuals of bone edges, beads and scatter hang together over about that much
 _SEEN = 1e-3  # of the largest curvature: directions that images tell something about
+_ONE_SIDE_DEG = 10.0  # about the implant's long axis: views so near each other show the same bone behind it
+_FOUND = 1.7  # how much further off optima were in simulations where screws were found, see docs/verdict.md
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +22,8 @@ class Uncertainty:
 
     Attributes:
         images: Curvature of the similarity.
-        disagreement: Sum of the squares of its gradients over blocks of pixels.
+        disagreement: Sum of the squares of its gradients over blocks of pixels, as much larger as views share what the
+            model lacks.
         penalties: Curvature of what speaks against parameters but the images.
         priors: Twice the weight of each prior times its curvature.
         blocks: How many blocks of pixels say something.
@@ -43,6 +46,8 @@ class Uncertainty:
         parameters: Tensor,
         *,
         pixel_mm: float,
+        views_a_side: float = 1.0,
+        screws_found: bool = False,
     ) -> Uncertainty:
         """Of residual images.
 
@@ -53,7 +58,11 @@ class Uncertainty:
             penalty: Of candidates (K, D).
             parameters: The optimum, shape (D,).
             pixel_mm: Of the images.
+            views_a_side: How many views look from one side: all that the model lacks they have in common, and they
+                agree with each other on what is wrong.
+            screws_found: Screws were found, not given: more may be wrong with them than images tell.
         """
+        factor = views_a_side * (_FOUND**2 if screws_found else 1.0)
         share = 0.5 / len(residuals)
         flat = jacobian.flatten(1)
         size = max(1, round(_BLOCK_MM / pixel_mm))
@@ -61,7 +70,7 @@ class Uncertainty:
         number = max(int((shares != 0).any(0).sum()), 2)
         return cls(
             share * (flat @ flat.T).double(),
-            number / (number - 1) * shares @ shares.T,
+            factor * number / (number - 1) * shares @ shares.T,
             _curvature(penalty, parameters),
             _of_priors(blocks, parameters),
             number,
@@ -75,8 +84,9 @@ class Uncertainty:
         of the loss, penalties included, g_b the share that one block of pixels has in its gradient. The blocks' shares
         sum to nothing but the penalty's gradient; what they scatter is how far the optimum would move if the blocks had
         been others. That holds for model error too, which is no noise: what matters is that it hangs together within
-        blocks and not beyond. Where a penalty is w times the square of deviations from a prior, its curvature P draws
-        the optimum towards what the prior expects, which is as likely off as that says: 2 w P.
+        blocks and not beyond. Between views from one side it does, so that their number multiplies it. Where a penalty
+        is w times the square of deviations from a prior, its curvature P draws the optimum towards what the prior
+        expects, which is as likely off as that says: 2 w P.
         """
         bread = self._bread()
         return bread @ (self.disagreement + self.priors) @ bread
@@ -102,6 +112,19 @@ class Uncertainty:
         whole = self.images + self.penalties
         same = torch.eye(len(whole), dtype=whole.dtype, device=whole.device)
         return torch.linalg.inv(whole + 1e-9 * whole.diagonal().mean() * same)
+
+
+def views_a_side(sources: Tensor, nodes: Tensor) -> float:
+    """How many of the views from sources (V, 3) look at an implant of nodes (N, 3) from one side, on average.
+
+    Sides are told by the angle about the implant's long axis.
+    """
+    center = nodes.mean(0)
+    axis = torch.linalg.eigh((nodes - center).mT @ (nodes - center)).eigenvectors[:, -1]
+    rays = torch.nn.functional.normalize(center - sources, dim=-1)
+    across = torch.nn.functional.normalize(rays - (rays @ axis)[:, None] * axis, dim=-1)
+    angles = torch.rad2deg(torch.acos((across @ across.mT).clamp(-1, 1)))
+    return float(torch.exp(-0.5 * (angles / _ONE_SIDE_DEG).square()).sum() / len(sources))
 
 
 def _of_priors(blocks: ParameterBlocks, parameters: Tensor) -> Tensor:

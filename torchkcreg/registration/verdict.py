@@ -10,8 +10,8 @@ Status = Literal["ok", "doubtful", "failed"]
 # Each threshold is where a simulated population parts best, see docs/verdict.md.
 _UNRELATED, _WEAK = 0.3, 0.6  # gradient correlation
 _NOTHING, _UNEXPLAINED = 0.2, 0.08  # misfit
-_DEVIATION_MM, _ANYWHERE_MM = 0.065, 0.3
-_DEVIATION_FOUND_MM = 0.025  # with screws that nobody told of: their metal and shape may be others
+_DEVIATION_MM, _ANYWHERE_MM = 0.11, 0.5
+_DEVIATION_FOUND_MM = 0.075  # with screws that nobody told of: their metal and shape may be others
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.0035  # root mean square strain
 _SURPRISING = 2.0  # mean square of loads in standard deviations; of plates on screws it is below one
