@@ -109,6 +109,19 @@ def test_a_registration_starts_from_an_earlier_one_of_the_same_implant(small_cas
     )
 
 
+def test_plan_ranks_views_without_any_image(small_case, tmp_path, capsys):
+    flags = [f"--implant={small_case / 'implant.stl'}", "--material=steel", f"--out={tmp_path / 'plan'}"]
+    geometry = f"--geometry={small_case / 'geometry.json'}"
+    assert main(["plan", *flags, geometry, f"--components={small_case / 'screws.json'}", "--most=3"]) == 0
+    assert {entry.name for entry in (tmp_path / "plan").iterdir()} == {"plan.json", "plan.csv", "plan.png"}
+    best = json.loads((tmp_path / "plan" / "plan.json").read_text())["best"]
+    assert len(best["2"]) == 3 and best["3"][0]["views"] == [0, 1, 2]
+    assert 0 < best["2"][0]["node_std_mm"] < best["2"][1]["node_std_mm"]
+    assert "2 views: " in capsys.readouterr().out
+    assert main(["plan", *flags, geometry, "--most=4"]) == 2
+    assert "3 views to choose from, fewer than the 4" in the_error(capsys, "plan")
+
+
 def test_compare_of_a_run_with_itself_finds_no_motion_and_writes_table_and_figure(finished, tmp_path, capsys):
     flags = ["--loads", "100", "200", f"--out={tmp_path / 'c'}"]
     assert main(["compare", str(finished), str(finished), str(finished), *flags]) == 0

@@ -72,6 +72,14 @@ class ParameterBlocks(Mapping[str, ParameterBlock]):
         """Of all blocks."""
         return sum(block.num_parameters for block in self._blocks.values())
 
+    @property
+    def places(self) -> dict[str, slice]:
+        """Where each block's parameters are."""
+        found, start = {}, 0
+        for name, block in self._blocks.items():
+            found[name] = slice(start, start := start + block.num_parameters)
+        return found
+
     def split(self, parameters: Tensor) -> dict[str, Tensor]:
         """Parameters (..., D) of each block.
 

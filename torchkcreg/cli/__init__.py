@@ -1,4 +1,4 @@
-"""The command line: ``torchkcreg register | warp | evaluate | load | compare | reconstruct | info | demo``."""
+"""The command line: ``torchkcreg register | warp | evaluate | load | compare | plan | reconstruct | info | demo``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from torchkcreg.console import one_line, run_command
 from .command import add_command
 from .compare import add_compare
 from .load import add_load
+from .plan import add_plan
 from .register import add_register
 
 # Before torch starts its threads. Between small operations they wait by spinning for a few microseconds: asleep at
@@ -52,6 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     add_load(commands)
     add_compare(commands)
+    add_plan(commands)
     _add_reconstruct(commands)
     _add_info(commands)
     _add_demo(commands)

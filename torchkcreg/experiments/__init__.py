@@ -7,6 +7,7 @@ from torchkcreg.experiments.describe import describe, describe_installation
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
 from torchkcreg.experiments.load_files import ImplantLoad, load_files
+from torchkcreg.experiments.plan_files import ViewPlan, plan_files
 from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
 from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles, ReconstructionOptions
 from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
@@ -24,6 +25,7 @@ __all__ = [
     "ReconstructionOptions",
     "RegistrationFiles",
     "SeedRuns",
+    "ViewPlan",
     "capture_study",
     "compare_files",
     "demo",
@@ -32,6 +34,7 @@ __all__ = [
     "draw_registration",
     "evaluate_files",
     "load_files",
+    "plan_files",
     "reconstruct_files",
     "register_files",
     "register_seeds",

@@ -140,16 +140,25 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
     """
     _check_options(files, config)
     with _noted() as notes:
-        each = files.each()
         data = _read_data(files, config)
         spectrum = read_spectrum(files.spectrum) if files.spectrum else None
-        implants = [_read_implant(one, config) for one in each]
+        implants = read_implants(files, config)
         for one in implants:
             points, pose = one.cloud.points, one.implant_to_world
             placed = points if pose is None else transform_points(pose, points.double())
             if (doubt := implausible_magnification(data.facing(placed).geometry, placed)) is not None:
                 warnings.warn(doubt, stacklevel=2)
     return RegistrationInputs(implants, data, spectrum, notes)
+
+
+def read_implants(files: RegistrationFiles, config: RegistrationConfig) -> list[Implant]:
+    """The implants of a registration, without its images.
+
+    Raises:
+        ValueError: If a file is malformed.
+        FileNotFoundError: If a file is missing.
+    """
+    return [_read_implant(one, config) for one in files.each()]
 
 
 def _read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:

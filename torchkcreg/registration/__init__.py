@@ -8,6 +8,7 @@ from .callbacks import ProgressBar, TrainerState
 from .config import RegistrationConfig, Stage, preset_stages
 from .models import Implant
 from .objective import Objective
+from .planning import PlannedSet, ViewInformation, view_information
 from .register import build_scene, register
 from .registered_implant import RegisteredImplant
 from .result import RegistrationResult
@@ -24,6 +25,7 @@ __all__ = [
     "Implant",
     "Objective",
     "Optimizer",
+    "PlannedSet",
     "Progress",
     "ProgressBar",
     "RegisteredImplant",
@@ -37,10 +39,12 @@ __all__ = [
     "Terms",
     "Trainer",
     "TrainerState",
+    "ViewInformation",
     "build_scene",
     "find_screws",
     "preset_stages",
     "register",
     "similarities",
+    "view_information",
     "with_background",
 ]

@@ -115,16 +115,21 @@ class Uncertainty:
 
 
 def views_a_side(sources: Tensor, nodes: Tensor) -> float:
-    """How many of the views from sources (V, 3) look at an implant of nodes (N, 3) from one side, on average.
+    """How many of the views from sources (V, 3) look at an implant of nodes (N, 3) from one side, on average."""
+    return float(likeness(sources, nodes).sum() / len(sources))
 
-    Sides are told by the angle about the implant's long axis.
+
+def likeness(sources: Tensor, nodes: Tensor) -> Tensor:
+    """How much each pair of views from sources (V, 3) looks at an implant of nodes (N, 3) from one side, (V, V).
+
+    1 for the same side, 0 for others, by the angle between them about the implant's long axis.
     """
     center = nodes.mean(0)
     axis = torch.linalg.eigh((nodes - center).mT @ (nodes - center)).eigenvectors[:, -1]
     rays = torch.nn.functional.normalize(center - sources, dim=-1)
     across = torch.nn.functional.normalize(rays - (rays @ axis)[:, None] * axis, dim=-1)
     angles = torch.rad2deg(torch.acos((across @ across.mT).clamp(-1, 1)))
-    return float(torch.exp(-0.5 * (angles / _ONE_SIDE_DEG).square()).sum() / len(sources))
+    return torch.exp(-0.5 * (angles / _ONE_SIDE_DEG).square())
 
 
 def _of_priors(blocks: ParameterBlocks, parameters: Tensor) -> Tensor:

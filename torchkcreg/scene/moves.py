@@ -113,10 +113,8 @@ class Moves(ParameterBlocks):
 
     def keep_covariance(self, covariance: Tensor) -> list[Tensor]:
         """Tells each motion the covariance of its steps, out of that of all parameters (D, D), and returns them."""
-        places, start = {}, 0
-        for name, block in self.items():
-            places[name] = slice(start, start := start + block.num_parameters)
-        own = [covariance[places[f"motion of {part.name}"]][:, places[f"motion of {part.name}"]] for part in self.parts]
+        places = [self.places[f"motion of {part.name}"] for part in self.parts]
+        own = [covariance[place, place] for place in places]
         for part, known in zip(self.parts, own, strict=True):
             part.bound.motion.keep_covariance(known)
         return own

@@ -10,6 +10,7 @@ from .errors import error_map_figure, histogram_figure
 from .history import history_figure
 from .load import load_figure
 from .overlay import overlay_figure
+from .plan import plan_figure
 from .reconstruction import reconstruction_figure
 
 __all__ = [
@@ -21,5 +22,6 @@ __all__ = [
     "history_figure",
     "load_figure",
     "overlay_figure",
+    "plan_figure",
     "reconstruction_figure",
 ]
