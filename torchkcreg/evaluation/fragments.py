@@ -63,7 +63,7 @@ def fragments_of(
     """
     nodes = nodes.double()
     middle = nodes.mean(0)
-    axis = torch.linalg.eigh((nodes - middle).mT @ (nodes - middle)).eigenvectors[:, -1]
+    axis = _long_axis(nodes)
     heads = torch.stack([middle, *(nodes.new_tensor(screw.start) for screw in screws)])[1:]
     if plane is not None:
         point, normal = plane
@@ -119,9 +119,12 @@ def _innermost(own: Tensor, others: Tensor) -> Tensor:
 
 def _in_the_middle(nodes: Tensor, point: Tensor) -> Tensor:
     """The centre of the implant's cross-section at a point."""
-    middle = nodes.mean(0)
-    axis = torch.linalg.eigh((nodes - middle).mT @ (nodes - middle)).eigenvectors[:, -1]
-    height = (nodes - point) @ axis
-    near = nodes[height.abs() <= height.abs().sort().values[len(nodes) // 50 + 1] + 1e-9]
-    center = near.mean(0)
+    axis = _long_axis(nodes)
+    height = ((nodes - point) @ axis).abs()
+    center = nodes[height <= height.sort().values[len(nodes) // 50 + 1] + 1e-9].mean(0)
     return center + ((point - center) @ axis) * axis
+
+
+def _long_axis(nodes: Tensor) -> Tensor:
+    away = nodes - nodes.mean(0)
+    return torch.linalg.eigh(away.mT @ away).eigenvectors[:, -1]
