@@ -152,4 +152,5 @@ def test_blocks_of_one_side_and_found_screws_widen_the_covariance() -> None:
     flat = jacobian.flatten(1)
     torch.testing.assert_close(alone, torch.linalg.inv(flat @ flat.T), rtol=0.35, atol=2e-5)
     torch.testing.assert_close(covariance(views_a_side=3.0), 3 * alone)
-    torch.testing.assert_close(covariance(screws_found=True), 1.9**2 * alone)
+    torch.testing.assert_close(covariance(screws_found=True), 1.5**2 * alone)
+    torch.testing.assert_close(covariance(screws_found=True, views_a_side=4.0), 8 * 1.5**2 * alone)

@@ -13,7 +13,8 @@ from torchkcreg.parameters import ParameterBlocks
 _BLOCK_MM = 12.0  # on the detector: residuals of bone edges, beads and scatter hang together over about that much
 _SEEN = 1e-3  # of the largest curvature: directions that images tell something about
 _ONE_SIDE_DEG = 10.0  # about the implant's long axis: views so near each other show the same bone behind it
-_FOUND = 1.9  # how much further off optima were in simulations where screws were found, see docs/verdict.md
+_FOUND = 1.5  # how much further off optima were in simulations where screws were found, see docs/uncertainty.md
+_FOUND_A_SIDE = 1.5  # power of the number of views from one side then: they agree on a wrong screw
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ class Uncertainty:
                 agree with each other on what is wrong.
             screws_found: Screws were found, not given: more may be wrong with them than images tell.
         """
-        factor = views_a_side * (_FOUND**2 if screws_found else 1.0)
+        factor = _FOUND**2 * views_a_side**_FOUND_A_SIDE if screws_found else views_a_side
         share = 0.5 / len(residuals)
         flat = jacobian.flatten(1)
         size = max(1, round(_BLOCK_MM / pixel_mm))
