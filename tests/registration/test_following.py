@@ -8,7 +8,7 @@ from small_scene import SCREW, image, pose, scene
 from test_register import PLAIN
 
 from torchkcreg.registration import Stage, StageRun
-from torchkcreg.registration.prepared import with_scatter_shapes
+from torchkcreg.registration.prepared import facing_data
 from torchkcreg.scene import RegistrationData
 from torchkcreg.scene.following import FollowingBackground
 
@@ -64,7 +64,7 @@ def test_the_gradient_of_an_objective_goes_through_it() -> None:
     data = RegistrationData(modelled.geometry, modelled.line_integrals - math.log(1.05))
     stage = Stage(bin=2, oversampling=1, similarity="gradient-difference", estimate=("scatter", "hardness"))
     here = scene(config, components=[SCREW])
-    run = StageRun(here, with_scatter_shapes(here, data, config), stage, config)
+    run = StageRun(here, facing_data(here, data, config), stage, config)
     run.with_background()
     objective = run.objective
     rest = objective.at_rest[0]

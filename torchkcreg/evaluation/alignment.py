@@ -8,7 +8,7 @@ import trimesh
 from pycpd import RigidRegistration
 from torch import Tensor
 
-from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
+from torchkcreg.geometry import fit_rigid, principal_axes, rigid_matrix, transform_points
 
 from .distances import closest_on_surface, finite_cloud
 
@@ -162,8 +162,8 @@ def principal_motions(moving: Tensor, fixed: Tensor) -> list[Tensor]:
 
 def _principal_frame(points: Tensor) -> tuple[Tensor, Tensor]:
     """Centre (3,) and principal axes (3, 3) in columns, a proper rotation."""
-    center = points.mean(0)
-    axes = torch.linalg.eigh((points - center).mT @ (points - center)).eigenvectors
+    center, rows = principal_axes(points)
+    axes = rows.mT.clone()
     axes[:, 0] *= torch.linalg.det(axes).sign()
     return center, axes
 

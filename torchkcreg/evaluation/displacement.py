@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import fit_rigid, transform_points
+from torchkcreg.geometry import fit_rigid, principal_axes, transform_points
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,7 @@ def displacement_map(
 
 def _along_the_implant(points: Tensor, warped: Tensor, distal_direction: Tensor) -> Tensor:
     """Position (N,) of each node along the implant's long axis, smallest at the distal end."""
-    centered = points - points.mean(0)
-    axis = torch.linalg.eigh(centered.mT @ centered).eigenvectors[:, -1]
-    along = centered @ axis
+    center, (*_, axis) = principal_axes(points)
+    along = (points - center) @ axis
     downwards = (warped - warped.mean(0)) @ distal_direction.to(warped)
     return along if float((along * downwards).sum()) <= 0 else -along

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from torchkcreg.geometry import principal_axes
 from torchkcreg.implant import Screw
 
 _SHAFT_POINTS = 11
@@ -62,8 +63,7 @@ def fragments_of(
         ValueError: If all screws, or hardly any nodes, belong to one fragment.
     """
     nodes = nodes.double()
-    middle = nodes.mean(0)
-    axis = _long_axis(nodes)
+    middle, (*_, axis) = principal_axes(nodes)
     heads = torch.stack([middle, *(nodes.new_tensor(screw.start) for screw in screws)])[1:]
     if plane is not None:
         point, normal = plane
@@ -119,12 +119,7 @@ def _innermost(own: Tensor, others: Tensor) -> Tensor:
 
 def _in_the_middle(nodes: Tensor, point: Tensor) -> Tensor:
     """The centre of the implant's cross-section at a point."""
-    axis = _long_axis(nodes)
+    _, (*_, axis) = principal_axes(nodes)
     height = ((nodes - point) @ axis).abs()
     center = nodes[height <= height.sort().values[len(nodes) // 50 + 1] + 1e-9].mean(0)
     return center + ((point - center) @ axis) * axis
-
-
-def _long_axis(nodes: Tensor) -> Tensor:
-    away = nodes - nodes.mean(0)
-    return torch.linalg.eigh(away.mT @ away).eigenvectors[:, -1]

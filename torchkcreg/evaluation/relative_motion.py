@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import fit_rigid, invert_rigid, transform_points, vector_from_rotation
+from torchkcreg.geometry import fit_rigid, invert_rigid, principal_axes, transform_points, vector_from_rotation
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import RegisteredImplant
 
@@ -17,7 +16,6 @@ from .fragments import Fragments
 
 _STATIONS = 49
 AXES = ("across", "out of plane", "along")
-Warp = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,47 +107,43 @@ def relative_motion(
         to_second: Rigid transform (4, 4) from the first registration's frame of the implant to the second's.
     """
     nodes = cloud.points.double()
-    other = torch.eye(4, dtype=torch.float64) if to_second is None else to_second
-
-    def warp_first(points: Tensor) -> Tensor:
-        return first.warp(points)
-
-    def warp_second(points: Tensor) -> Tensor:
-        return second.warp(transform_points(other, points))
-
-    upwards = warp_first(fragments.upper).mean(0) - warp_first(fragments.lower).mean(0)
+    upwards = first.warp(fragments.upper).mean(0) - first.warp(fragments.lower).mean(0)
     if float(upwards[2]) < 0:
         fragments, upwards = fragments.swapped(), -upwards
-    axes = _axes(first, nodes, warp_first, upwards)
-    heights, centers = _stations(cloud, warp_first(nodes) @ axes[2])
+    axes = _axes(first, nodes, upwards)
+    heights, centers = _stations(cloud, first.warp(nodes) @ axes[2])
     groups = (fragments.lower, fragments.upper, fragments.gap[None], centers)
     points = torch.cat(groups)
+    in_second = points if to_second is None else transform_points(to_second, points)
     sizes = [len(group) for group in groups]
 
-    def numbers(before: Tensor, after: Tensor) -> Tensor:
-        (low0, up0, gap, line), (low1, up1, _, moved) = before.split(sizes), after.split(sizes)
+    def motions(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+        """What takes the lower fragment back, and the upper one's motion against it."""
+        (low0, up0, *_), (low1, up1, *_) = before.split(sizes), after.split(sizes)
         back = invert_rigid(fit_rigid(low0, low1))
-        motion = back @ fit_rigid(up0, up1)
+        return back, back @ fit_rigid(up0, up1)
+
+    def numbers(before: Tensor, after: Tensor) -> Tensor:
+        (*_, gap, line), (*_, moved) = before.split(sizes), after.split(sizes)
+        back, motion = motions(before, after)
         turned = torch.rad2deg(axes @ vector_from_rotation(motion[:3, :3]))
         shifted = axes @ (transform_points(motion, gap) - gap)[0]
         return torch.cat([turned, shifted, ((transform_points(back, moved) - line) @ axes.mT).flatten()])
 
-    before, after = warp_first(points), warp_second(points)
+    before, after = first.warp(points), second.warp(in_second)
     found = numbers(before, after)
     squares = torch.zeros_like(found)
     if first.deviations is not None:
         for field in first.deviations.at(points):
             squares += (numbers(before + field, after) - found).square()
     if second.deviations is not None:
-        for field in second.deviations.at(transform_points(other, points)):
+        for field in second.deviations.at(in_second):
             squares += (numbers(before, after + field) - found).square()
     unknown = first.deviations is None or second.deviations is None
     std = torch.full_like(found, torch.nan) if unknown else squares.sqrt()
-    low0, up0, *_ = before.split(sizes)
-    low1, up1, *_ = after.split(sizes)
     return RelativeMotion(
         axes=axes,
-        motion=invert_rigid(fit_rigid(low0, low1)) @ fit_rigid(up0, up1),
+        motion=motions(before, after)[1],
         rotation_deg=found[:3],
         rotation_std_deg=std[:3],
         translation_mm=found[3:6],
@@ -162,11 +156,10 @@ def relative_motion(
     )
 
 
-def _axes(implant: RegisteredImplant, nodes: Tensor, warp: Warp, upwards: Tensor) -> Tensor:
+def _axes(implant: RegisteredImplant, nodes: Tensor, upwards: Tensor) -> Tensor:
     """The implant's axes in the world, (3, 3): across, out of plane, along; the same whatever its frame."""
-    away = nodes - nodes.mean(0)
-    thin, _, along = torch.linalg.eigh(away.mT @ away).eigenvectors.mT
-    turn = fit_rigid(nodes, warp(nodes))[:3, :3]
+    _, (thin, _, along) = principal_axes(nodes)
+    turn = fit_rigid(nodes, implant.warp(nodes))[:3, :3]
     thin, along = turn @ thin, turn @ along
     along = along if float(along @ upwards) > 0 else -along
     if implant.screws:

@@ -6,6 +6,7 @@ from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.describe import describe, describe_installation
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
+from torchkcreg.experiments.implant_of_run import implant_of_run
 from torchkcreg.experiments.load_files import ImplantLoad, load_files
 from torchkcreg.experiments.plan_files import ViewPlan, plan_files
 from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
@@ -33,6 +34,7 @@ __all__ = [
     "describe_installation",
     "draw_registration",
     "evaluate_files",
+    "implant_of_run",
     "load_files",
     "plan_files",
     "reconstruct_files",

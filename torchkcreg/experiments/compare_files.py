@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from torchkcreg.evaluation import AXES, RelativeMotion, fragments_of, frame_changes, relative_motion
-from torchkcreg.experiments.mesh_of_run import mesh_of_run
+from torchkcreg.experiments.implant_of_run import implant_of_run, mesh_of_run
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.io import read_mesh, read_run, write_figure, write_json, write_text
+from torchkcreg.io import read_mesh, write_figure, write_json, write_text
 from torchkcreg.plain import plain
 from torchkcreg.registration import RegisteredImplant
 from torchkcreg.visualization import comparison_figure
@@ -148,11 +148,7 @@ def compare_files(
 
 
 def _implant(folder: Path, name: str | None):
-    result = read_run(folder)
-    try:
-        implant = result.implant(name)
-    except KeyError as error:
-        raise ValueError(f"run folder {folder}: {error.args[0]}") from None
+    result, implant = implant_of_run(folder, name)
     said = [f"{folder} is {result.status}: {why}" for why in result.warnings if result.status != "ok"]
     if implant.deviations is None:
         said.append(f"{folder} was written before registrations kept their deviations: there are no error bars")

@@ -19,7 +19,7 @@ from torchkcreg.evaluation import (
     point_errors,
 )
 from torchkcreg.evaluation.shape import ReferenceKind
-from torchkcreg.experiments.mesh_of_run import mesh_of_run
+from torchkcreg.experiments.implant_of_run import mesh_of_run
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import read_mesh, read_points, read_reference, read_run, write_figure
 from torchkcreg.registration import RegistrationResult

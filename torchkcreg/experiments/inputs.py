@@ -140,9 +140,10 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
     """
     _check_options(files, config)
     with _noted() as notes:
+        each = files.each()
         data = _read_data(files, config)
         spectrum = read_spectrum(files.spectrum) if files.spectrum else None
-        implants = read_implants(files, config)
+        implants = [read_implant(one, config) for one in each]
         for one in implants:
             points, pose = one.cloud.points, one.implant_to_world
             placed = points if pose is None else transform_points(pose, points.double())
@@ -151,17 +152,13 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
     return RegistrationInputs(implants, data, spectrum, notes)
 
 
-def read_implants(files: RegistrationFiles, config: RegistrationConfig) -> list[Implant]:
-    """The implants of a registration, without its images.
+def read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
+    """One implant of a registration.
 
     Raises:
         ValueError: If a file is malformed.
         FileNotFoundError: If a file is missing.
     """
-    return [_read_implant(one, config) for one in files.each()]
-
-
-def _read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
     screws = read_components(files.components) if files.components else []
     mesh = read_mesh(files.mesh)
     pose = _start_pose(files, mesh)

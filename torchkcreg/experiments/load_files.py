@@ -12,8 +12,8 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.deformation import FiniteElementDeformation
-from torchkcreg.experiments.mesh_of_run import mesh_of_run
-from torchkcreg.io import read_mesh, read_run, write_figure, write_json, write_surface_vtu
+from torchkcreg.experiments.implant_of_run import implant_of_run, mesh_of_run
+from torchkcreg.io import read_mesh, write_figure, write_json, write_surface_vtu
 from torchkcreg.mechanics import CarriedLoad, node_stresses
 from torchkcreg.plain import plain
 from torchkcreg.registration import RegisteredImplant
@@ -87,16 +87,12 @@ def load_files(
         ValueError: If a run is not one with finite elements, or the two are of different implants.
         FileNotFoundError: If a file is missing.
     """
-    result = read_run(run_folder)
-    try:
-        registered = result.implant(name)
-    except KeyError as error:
-        raise ValueError(f"run folder {run_folder}: {error.args[0]}") from None
+    result, registered = implant_of_run(run_folder, name)
     own = _elastic(registered, run_folder)
     amounts, covariance = own.amounts.detach(), own.covariance
     warnings = [f"the registration is {result.status}: {why}" for why in result.warnings if result.status != "ok"]
     if against is not None:
-        other = _elastic(read_run(against).implant(name), against)
+        other = _elastic(implant_of_run(against, name)[1], against)
         _require_same(own, other)
         amounts = amounts - other.amounts.detach()
         covariance = None if covariance is None or other.covariance is None else covariance + other.covariance

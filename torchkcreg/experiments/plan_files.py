@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchkcreg.experiments.inputs import RegistrationFiles, read_implants
+from torchkcreg.experiments.inputs import ImplantFiles, read_implant
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.io import read_geometry, read_spectrum, write_figure, write_json, write_text
 from torchkcreg.plain import plain
@@ -51,8 +51,8 @@ class ViewPlan:
     def to_dict(self) -> dict[str, Any]:
         """Plain types."""
         return {
-            "best": {str(n): [_plain(one) for one in sets] for n, sets in self.best.items()},
-            "of_sources": {name: _plain(one) for name, one in self.of_sources.items()},
+            "best": {str(n): [asdict(one) for one in sets] for n, sets in self.best.items()},
+            "of_sources": {name: asdict(one) for name, one in self.of_sources.items()},
             "random_median_mm": {str(n): float(errors.median()) for n, errors in self.random.items()},
         }
 
@@ -109,12 +109,8 @@ def plan_files(
     if every < 1 or most < 2:
         raise ValueError(f"every must be at least 1 and most at least 2, got {every} and {most}")
     config = RegistrationConfig(material=material)
-    files = RegistrationFiles(
-        implant=implant, geometry=geometry, projections=geometry, components=components, init=init
-    )
-    scene = build_scene(
-        read_implants(files, config), config, spectrum=read_spectrum(spectrum) if spectrum is not None else None
-    )
+    placed = read_implant(ImplantFiles("implant", implant, components, init, None), config)
+    scene = build_scene(placed, config, spectrum=read_spectrum(spectrum) if spectrum is not None else None)
     views = read_geometry(geometry)
     chosen = list(range(0, views.num_views, every))
     if len(chosen) < most:
@@ -147,7 +143,3 @@ def _of_sources(known: ViewInformation, sources: Sequence[str] | None, number: i
         return {}
     own = {name: [view for view in known.views if sources[view] == name] for name in names}
     return {name: known.best(number, among=views)[0] for name, views in own.items() if len(views) >= number}
-
-
-def _plain(one: PlannedSet) -> dict[str, Any]:
-    return {"views": list(one.views), "node_std_mm": one.node_std_mm}

@@ -7,6 +7,7 @@ else about it (source, rays, pixel positions) is derived from that.
 from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
 from torchkcreg.geometry.multisource import MultisourceScanner
+from torchkcreg.geometry.principal import principal_axes
 from torchkcreg.geometry.se3 import (
     across,
     fit_rigid,
@@ -28,6 +29,7 @@ __all__ = [
     "fit_rigid",
     "invert_rigid",
     "matrices_from_frames",
+    "principal_axes",
     "rigid_matrix",
     "rotation_about",
     "rotation_from_vector",

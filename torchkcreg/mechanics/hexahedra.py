@@ -103,7 +103,7 @@ class Hexahedra:
 
     def shape_functions(self, inside: Tensor) -> tuple[Tensor, Tensor]:
         """Values (P, 27) and gradients (P, 27, 3), 1/mm in the lattice's frame, at places (P, 3) inside cubes."""
-        values, slopes = _quadratics(inside), _quadratic_slopes(inside) * (2 / self.edge)
+        values, slopes = quadratics(inside), _quadratic_slopes(inside) * (2 / self.edge)
         (x, y, z), (dx, dy, dz) = values.unbind(1), slopes.unbind(1)
         together = torch.einsum("pi,pj,pk->pijk", x, y, z).flatten(1)
         gradients = [
@@ -120,7 +120,7 @@ def interpolated(hexahedra: Hexahedra, nodal: Tensor, cube: Tensor, inside: Tens
     return found.unflatten(1, (len(nodal), 3)).transpose(0, 1)
 
 
-def _quadratics(inside: Tensor) -> Tensor:
+def quadratics(inside: Tensor) -> Tensor:
     """Lagrange polynomials (P, 3, 3) through -1, 0 and 1, along each axis."""
     return torch.stack([inside * (inside - 1) / 2, 1 - inside**2, inside * (inside + 1) / 2], dim=-1)
 

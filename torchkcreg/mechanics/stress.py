@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics.hexahedra import Hexahedra
+from torchkcreg.mechanics.hexahedra import Hexahedra, quadratics
 from torchkcreg.physics import ElasticConstants
 
 _NODES = (0, 2, 6, 8, 9, 11, 15, 17, 18, 20, 24, 26)  # of a cube's 27: three through the thickness, two across it
@@ -72,10 +72,9 @@ class StressField:
     def at(self, points: Tensor) -> Tensor:
         """Stresses (L, P, 3, 3) at points (P, 3) of the implant's frame, N/mm^2, in its axes."""
         cube, inside = self.hexahedra.locate(points, self.trusted)
-        through, *lines = inside.clamp(-_BEYOND, _BEYOND).unbind(-1)
-        straight = [torch.stack([1 - x, 1 + x], dim=-1) / 2 for x in lines]
-        curved = torch.stack([through * (through - 1) / 2, 1 - through**2, through * (through + 1) / 2], dim=-1)
-        shares = torch.einsum("pi,pj,pk->pijk", curved, *straight).flatten(1)
+        inside = inside.clamp(-_BEYOND, _BEYOND)
+        straight = [torch.stack([1 - x, 1 + x], dim=-1) / 2 for x in inside[:, 1:].unbind(-1)]
+        shares = torch.einsum("pi,pj,pk->pijk", quadratics(inside)[:, 0], *straight).flatten(1)
         return torch.einsum("pc,lpcij->lpij", shares, self.nodal[:, self.hexahedra.nodes[:, list(_NODES)][cube]])
 
 

@@ -14,7 +14,7 @@ from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.scene import RegistrationData, Scene
 
 from .config import RegistrationConfig
-from .prepared import with_scatter_shapes
+from .prepared import facing_data
 from .stage_run import StageRun
 from .uncertainty import likeness
 
@@ -144,9 +144,7 @@ def view_information(
         some = geometry.select(numbers[start : start + _AT_ONCE])
         lines = scene(some)
         data = RegistrationData(some, lines, torch.ones_like(lines, dtype=torch.bool))
-        for assembly in scene:
-            data = data.facing(assembly.nodes())
-        run = StageRun(scene, with_scatter_shapes(scene, data, config), stage, config)
+        run = StageRun(scene, facing_data(scene, data, config), stage, config)
         objective = run.objective
         jacobian, _ = objective.jacobian(objective.at_rest[0])
         flat = jacobian.transpose(0, 1).flatten(2).double()

@@ -17,8 +17,10 @@ def data_with_background(
     return with_background(scene, data, max(config.background_mm, _BACKGROUND_PIXELS * bin * pixel))
 
 
-def with_scatter_shapes(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
-    """The data with the shapes of the scatter, where the intensity model has scatter."""
+def facing_data(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
+    """The data whose views look at the implants, with the shapes of the scatter where the intensity model has it."""
+    for assembly in scene:
+        data = data.facing(assembly.nodes())
     if not scene.intensity.has_background or data.scatter_shapes is not None:
         return data
     return data.with_scatter_shapes(config.scatter_mm)

@@ -14,7 +14,7 @@ from torchkcreg.scene import RegistrationData, Scene
 from .config import PHYSICS, RegistrationConfig, Stage
 from .finish import finished
 from .guard import Guard
-from .prepared import with_scatter_shapes
+from .prepared import facing_data
 from .result import RegistrationResult
 from .stage_run import StageRun, Step, Terms
 from .steps import AFTER, BEFORE, CHANGE_SCENE
@@ -69,9 +69,7 @@ class Trainer:
         seconds: float | None = None,
     ) -> None:
         self.scene, self.config, self.callbacks = scene, config, list(callbacks)
-        for assembly in scene:
-            data = data.facing(assembly.nodes())
-        self.data = with_scatter_shapes(scene, data, config)
+        self.data = facing_data(scene, data, config)
         self.stages = config.schedule()
         self.terms = terms or Terms()
         self.steps = {**BEFORE, **AFTER, **(steps or {})}

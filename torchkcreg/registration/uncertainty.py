@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchkcreg.geometry import principal_axes
 from torchkcreg.parameters import ParameterBlocks
 
 _BLOCK_MM = 12.0  # on the detector: residuals of bone edges, beads and scatter hang together over about that much
@@ -125,8 +126,7 @@ def likeness(sources: Tensor, nodes: Tensor) -> Tensor:
 
     1 for the same side, 0 for others, by the angle between them about the implant's long axis.
     """
-    center = nodes.mean(0)
-    axis = torch.linalg.eigh((nodes - center).mT @ (nodes - center)).eigenvectors[:, -1]
+    center, (*_, axis) = principal_axes(nodes)
     rays = torch.nn.functional.normalize(center - sources, dim=-1)
     across = torch.nn.functional.normalize(rays - (rays @ axis)[:, None] * axis, dim=-1)
     angles = torch.rad2deg(torch.acos((across @ across.mT).clamp(-1, 1)))

@@ -1,10 +1,25 @@
-"""Where the mesh is that a run was started with."""
+"""An implant of a run, and where the mesh is that the run was started with."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from torchkcreg.io import read_config
+from torchkcreg.io import read_config, read_run
+from torchkcreg.registration import RegisteredImplant, RegistrationResult
+
+
+def implant_of_run(run_folder: Path, name: str | None = None) -> tuple[RegistrationResult, RegisteredImplant]:
+    """The result of a finished run and its implant of a name, the first one without.
+
+    Raises:
+        FileNotFoundError: If there is no finished run.
+        ValueError: If there is no implant of that name, or a file is damaged.
+    """
+    result = read_run(run_folder)
+    try:
+        return result, result.implant(name)
+    except KeyError as error:
+        raise ValueError(f"run folder {run_folder}: {error.args[0]}") from None
 
 
 def mesh_of_run(run_folder: Path, number: int = 0) -> Path:
