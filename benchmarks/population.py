@@ -37,6 +37,7 @@ from tqdm import tqdm  # noqa: E402
 from torchkcreg.deformation import Deformation, FiniteElementDeformation  # noqa: E402
 from torchkcreg.evaluation import bb_rmse  # noqa: E402
 from torchkcreg.experiments.capture import registration_inputs  # noqa: E402
+from torchkcreg.geometry import ConeBeamGeometry, fit_rigid, transform_points  # noqa: E402
 from torchkcreg.implant import find_holes  # noqa: E402
 from torchkcreg.mechanics import CarriedLoad  # noqa: E402
 from torchkcreg.physics import line_integrals_from_intensity  # noqa: E402
@@ -48,12 +49,14 @@ from torchkcreg.registration import (  # noqa: E402
     Trainer,
     build_scene,
 )
+from torchkcreg.scene import ViewMotions  # noqa: E402
 from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case  # noqa: E402
 
 WRONG_MM, RIGHT_MM = 0.15, 0.10
+ERRORS = {"detector": 0.3, "source": 0.2, "limb": 0.3}  # of a geometry: pixels, mm, mm
 WIDTHS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.96, 2.25, 2.5, 2.75, 3.0, 3.5, 4.0)
 _MOMENTS = ("true", "found", "std")
-Job = tuple[int, str, bool, bool, dict[str, Any], str, str]
+Job = tuple[int, str, bool, bool, dict[str, Any], str, str, str]
 
 
 class _ErrorsOfStages(Callback):
@@ -79,8 +82,59 @@ def unrelated_images(case: SimulatedCase, draw: Draw, data: RegistrationData, im
     return {"line_integrals": lines, "mask": mask, "geometry": other.geometry}
 
 
+def wrong_geometry(geometry: ConeBeamGeometry, nodes: torch.Tensor, error: str, seed: int) -> ConeBeamGeometry:
+    """The geometry that a registration is told where the scan was made with another.
+
+    Errors are independent in each view and sum to nothing over all: what views have in common moves the implant, which
+    no image tells from a scanner that stands elsewhere.
+
+    Args:
+        geometry: Of the images.
+        nodes: World positions (N, 3) of the implant.
+        error: "detector": 0.3 pixels along rows and columns; "source": 0.2 mm along each axis; "limb": a rigid motion
+            between views that moves nodes by 0.3 mm, root mean square; "all" of them.
+        seed: Of the random numbers.
+    """
+    rng = np.random.default_rng([seed, 77])
+    number = geometry.num_views
+    drawn = [torch.from_numpy(rng.normal(size=(number, n))) for n in (2, 3, 6)]
+    pixels, shifts, motions = (x - x.mean(0) for x in drawn)
+    matrices = geometry.projection_matrices.clone()
+    if error in ("detector", "all"):
+        matrices[:, :2] += ERRORS["detector"] * pixels[..., None] * matrices[:, 2:]
+    if error in ("source", "all"):
+        distances = geometry.detector_distances
+        for view, shift in enumerate(ERRORS["source"] * shifts):
+            matrices[view] = with_source(matrices[view], float(distances[view]), shift)
+    if error in ("limb", "all"):
+        moved = ViewMotions(nodes, number, 1.0)
+        moved.values.copy_(ERRORS["limb"] / math.sqrt(5) * motions)  # about its long axis a plate hardly moves
+        matrices = matrices @ moved.matrices()
+    return ConeBeamGeometry(
+        matrices,
+        geometry.det_shape,
+        geometry.pixel_spacing,
+        sources=geometry.sources,
+        angles_deg=geometry.angles_deg,
+    )
+
+
+def with_source(matrix: torch.Tensor, distance: float, shift: torch.Tensor) -> torch.Tensor:
+    """The projection matrix (3, 4) after its source has moved by (3,) mm while the detector stays, so far from it."""
+    inverse = torch.linalg.inv(matrix[:, :3])
+    source = -inverse @ matrix[:, 3] + shift
+    inverse[:, 2] -= shift / distance
+    rotated = torch.linalg.inv(inverse)
+    return torch.cat([rotated, -(rotated @ source)[:, None]], dim=1)
+
+
 def register_case(
-    case: SimulatedCase, draw: Draw, known: bool, options: dict[str, Any], images: str = "own"
+    case: SimulatedCase,
+    draw: Draw,
+    known: bool,
+    options: dict[str, Any],
+    images: str = "own",
+    geometry: str = "right",
 ) -> dict[str, Any]:
     """The row of one case: errors in mm and what the registration says of itself."""
     config = RegistrationConfig(material=case.implant_material, **options)
@@ -89,6 +143,8 @@ def register_case(
         data = replace(data, **unrelated_images(case, draw, data, images))
     nodes = cloud.coarsened(8).points.double()
     truth = case.deform(nodes)
+    if geometry != "right":
+        data = replace(data, geometry=wrong_geometry(data.geometry, truth, geometry, draw.seed))
     start = time.perf_counter()
     scene = build_scene(
         cloud,
@@ -99,7 +155,8 @@ def register_case(
     )
     trace = _ErrorsOfStages(truth)
     result = Trainer(scene, data, config, callbacks=[trace]).fit()
-    errors = result.warp(nodes) - truth
+    found = result.warp(nodes)
+    errors = found - truth
     ray = case.geometry.source_positions.double().mean(0) - nodes.mean(0)
     depth = errors @ (ray / ray.norm())
     beads = float(bb_rmse(result.warp(case.beads_before.double()), case.beads_after.double()))
@@ -108,6 +165,7 @@ def register_case(
         "seed": draw.seed,
         "beads": round(beads, 4),
         "nodes": round(node, 4),
+        "shape": round(float(bb_rmse(transform_points(fit_rigid(found, truth), found), truth)), 4),
         "largest_third": round(largest, 4),
         "worst": round(max(beads, node, largest), 4),
         "depth": round(float(depth.square().mean().sqrt()), 4),
@@ -204,7 +262,7 @@ def load_summary(rows: list[dict[str, Any]], place: str) -> str:
 
 
 def _job(job: Job) -> dict[str, Any]:
-    seed, views, elastic, known, options, images, cache = job
+    seed, views, elastic, known, options, images, geometry, cache = job
     torch.set_num_threads(1)
     draw = draw_case(seed)
     kept = Path(cache) / f"{'elastic-' if elastic else ''}{views}-{seed}.npy" if cache else None
@@ -213,7 +271,7 @@ def _job(job: Job) -> dict[str, Any]:
         kept.parent.mkdir(parents=True, exist_ok=True)
         np.save(kept, case.intensity.numpy())
     try:
-        row = register_case(case, draw, known, options, images)
+        row = register_case(case, draw, known, options, images, geometry)
         return row if images == "own" else {**row, "worst": float("inf")}
     except (ValueError, RuntimeError) as error:
         return {"seed": seed, "status": "failed", "warnings": f"{type(error).__name__}: {error}", "worst": float("inf")}
@@ -311,6 +369,7 @@ def main() -> None:
     parser.add_argument(
         "--images", choices=("own", "other", "mirrored", "turned"), default="own", help="else: wrong ones"
     )
+    parser.add_argument("--geometry", choices=("right", *ERRORS, "all"), default="right", help="else: one that is off")
     parser.add_argument("--options", type=json.loads, default={}, help="options of the registration as JSON")
     parser.add_argument("--cache", default="", help="folder that keeps the images")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
@@ -319,8 +378,17 @@ def main() -> None:
     name = f"population-{options.views}-{'known' if options.known else 'plain'}"
     name += "-elastic" if options.elastic else ""
     name += "" if options.images == "own" else f"-{options.images}"
+    name += "" if options.geometry == "right" else f"-{options.geometry}"
     seeds = options.seeds or range(options.first, options.first + options.cases)
-    same = (options.views, options.elastic, options.known, options.options, options.images, options.cache)
+    same = (
+        options.views,
+        options.elastic,
+        options.known,
+        options.options,
+        options.images,
+        options.geometry,
+        options.cache,
+    )
     jobs = [(seed, *same) for seed in seeds]
     rows = sorted(rows_of(options.out / f"{name}.jsonl", jobs), key=lambda row: row["seed"])
     with (options.out / f"{name}.csv").open("w", newline="") as file:

@@ -109,6 +109,26 @@ def test_a_registration_starts_from_an_earlier_one_of_the_same_implant(small_cas
     )
 
 
+def test_finite_elements_bend_an_implant_from_the_shape_of_an_earlier_run(small_case, finished, tmp_path, capsys):
+    from torchkcreg.experiments import RegistrationFiles
+    from torchkcreg.experiments.inputs import read_inputs
+    from torchkcreg.registration import RegistrationConfig, build_scene
+
+    names = {"geometry": small_case / "geometry.json", "projections": small_case / "projections.npz"}
+    files = RegistrationFiles(implant=small_case / "implant.stl", rest=finished, **names)
+    config = RegistrationConfig(pitch_mm=1.0, deformation="fe", material="steel")
+    inputs, before = read_inputs(files, config), read_run(finished)
+    torch.testing.assert_close(inputs.starts[0], before.implant_to_world)
+    points = inputs.implants[0].cloud.points.double()
+    scene = build_scene(inputs.implants, config)
+    torch.testing.assert_close(scene.assemblies[0].warp(points), before.warp(points), atol=1e-6, rtol=0)
+    assert scene.assemblies[0].deformation.rest_spread is not None
+    out = tmp_path / "run"
+    asked = command(small_case, out, rest=finished, material="steel", deformation="modes")
+    assert "--deformation fe" in rejected(asked, out, capsys)
+    assert "no finished" in rejected(command(small_case, out, rest=tmp_path, deformation="fe"), out, capsys)
+
+
 def test_plan_ranks_views_without_any_image(small_case, tmp_path, capsys):
     flags = [f"--implant={small_case / 'implant.stl'}", "--material=steel", f"--out={tmp_path / 'plan'}"]
     geometry = f"--geometry={small_case / 'geometry.json'}"

@@ -53,7 +53,7 @@ def finite_number(value: Any, name: str, *, positive: bool = False) -> float:
 def finite_array(value: Any, shape: tuple[int, ...], name: str) -> torch.Tensor:
     """`value` (nested lists) as a float64 tensor of `shape`; ValueError(name ...) when it is anything else."""
     try:
-        array = np.array(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
+        array = np.array(value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value)
     except ValueError:
         array = np.array(None)
     if array.shape != shape or array.dtype.kind not in "iuf":

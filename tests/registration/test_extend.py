@@ -164,7 +164,7 @@ def test_a_step_of_ones_own_is_taken_and_an_unknown_one_refused() -> None:
 
     register(plate(), data, config, steps={"look": look})
     assert len(taken) == 2 and min(taken) > 0.99
-    with pytest.raises(ValueError, match="there is no step 'look': steps are background"):
+    with pytest.raises(ValueError, match="there is no step 'look': steps are align, background"):
         register(plate(), data, config)
 
 

@@ -26,6 +26,8 @@ def add_register(commands) -> None:
     command.add_argument("--components", type=_path_or_none, action="append", help=screws)
     start = "approximate implant_to_world (JSON), or the run folder of an earlier registration, such as without load"
     command.add_argument("--init", type=_path_or_none, action="append", help=start)
+    rest = "run folder of a registration without load: finite elements bend the implant from that shape"
+    command.add_argument("--rest", type=_path_or_none, action="append", help=rest)
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, where the file does not say it")
     command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
     command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")
@@ -66,7 +68,7 @@ def _register(options: argparse.Namespace) -> int:
     if options.seeds is not None and options.resume:
         raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")
     named = ("geometry", "projections", "spectrum", "views", "open_beam", "config")
-    each = {name: _only(getattr(options, name)) for name in ("implant", "components", "init")}
+    each = {name: _only(getattr(options, name)) for name in ("implant", "components", "init", "rest")}
     materials = options.material if options.material and len(options.material) > 1 else None
     files = RegistrationFiles(**each, materials=materials, **{name: getattr(options, name) for name in named})
     names = ("preset", "deformation", "pitch_mm", "seed", "backend", "device")

@@ -22,6 +22,7 @@ from torchkcreg.deformation.model import Deformation, Level, Motion
 from torchkcreg.deformation.penalty import diffusion_penalty, without_rigid
 from torchkcreg.deformation.prior import BendingPrior
 from torchkcreg.deformation.reading import deformation_from_dict
+from torchkcreg.deformation.rest_shape import bent_cloud, bent_hold, spread_of_rest
 from torchkcreg.deformation.spline_field import SplineField
 from torchkcreg.deformation.strain import strain_energy
 
@@ -42,6 +43,8 @@ __all__ = [
     "Motion",
     "RigidDeformation",
     "SplineField",
+    "bent_cloud",
+    "bent_hold",
     "cluster_control_points",
     "control_point_volumes",
     "control_points_from_groups",
@@ -53,6 +56,7 @@ __all__ = [
     "group_moments",
     "moment_features",
     "motion_coefficients",
+    "spread_of_rest",
     "strain_energy",
     "without_rigid",
 ]

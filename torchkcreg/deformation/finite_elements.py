@@ -31,6 +31,9 @@ class FiniteElementDeformation(Deformation):
         unused: How strong loads are at holds without a screw, against those with one, where screws are known.
         shares: That of each hold, (H,); one when None.
         covariance: Of the amounts, (A, A), mm^2, where a registration has found it.
+        rest: From the undeformed implant to the shape that loads bend, which is the superelement's; the undeformed one
+            when None. It stays as it is.
+        rest_spread: Covariance of amounts that are none but errors of the rest shape, see `spread_of_rest`.
 
     Attributes:
         amounts: Parameter (A,), float64.
@@ -50,8 +53,11 @@ class FiniteElementDeformation(Deformation):
         unused: float = 1.0,
         shares: Tensor | None = None,
         covariance: Tensor | None = None,
+        rest: Deformation | None = None,
+        rest_spread: Tensor | None = None,
     ) -> None:
         super().__init__()
+        self.rest, self.rest_spread = None if rest is None else rest.requires_grad_(False), rest_spread
         self.superelement, self.unused, self.covariance = superelement, unused, covariance
         self.weighed = weighed
         weight = torch.tensor(load_weight, dtype=torch.float64, device=superelement.expected.device)
@@ -67,8 +73,9 @@ class FiniteElementDeformation(Deformation):
         self.superelement = self.superelement.to(self.amounts.device)
         self.shares = self.shares.to(self.amounts.device)
         self.expected = ExpectedLoads.of(self.superelement, self.shares)
-        if self.covariance is not None:
-            self.covariance = self.covariance.to(self.amounts.device)
+        for name in ("covariance", "rest_spread"):
+            if (known := getattr(self, name)) is not None:
+                setattr(self, name, known.to(self.amounts.device))
         return self
 
     @property
@@ -79,9 +86,14 @@ class FiniteElementDeformation(Deformation):
     def displacement(self, points: Tensor) -> Tensor:
         """Displacements u, mm, of points (..., N, 3) in the implant's frame."""
         flat, element = points.reshape(-1, 3).double(), self.superelement
-        moved = section_features(element, flat) @ section_coefficients(element, self.amounts[None])[0]
-        moved = moved + element.remainder(flat, self.amounts[None])[0]
+        rested = self.rested(flat)
+        moved = section_features(element, rested) @ section_coefficients(element, self.amounts[None])[0]
+        moved = moved + element.remainder(rested, self.amounts[None])[0] + (rested - flat)
         return moved.reshape(points.shape).to(points)
+
+    def rested(self, points: Tensor) -> Tensor:
+        """Points (..., 3) of the undeformed implant's frame where they are without load."""
+        return points if self.rest is None else self.rest(points)
 
     def motion(self, cloud: ImplantPointCloud, level: Level) -> Motion:
         """Rotation and translation of the whole, and as many of the softest ways to bend as the level allows.
@@ -94,15 +106,20 @@ class FiniteElementDeformation(Deformation):
         free = min(wanted - RigidMotion.num_parameters, self.superelement.num_amounts)
         return FiniteElementMotion(self, cloud, free)
 
+    def strained(self, points: Tensor) -> Tensor:
+        """Jacobians (..., N, 3, 3) at points (..., N, 3) against the rest shape."""
+        whole = self.jacobian(points)
+        return whole if self.rest is None else whole @ torch.linalg.inv(self.rest.jacobian(points))
+
     def fixed_at(self, heads: Tensor) -> None:
         """Holds without a screw carry less from now on, see :func:`torchkcreg.mechanics.shares_of_holds`."""
-        self.shares = shares_of_holds(self.superelement, heads, self.unused)
+        self.shares = shares_of_holds(self.superelement, self.rested(heads), self.unused)
         self.expected = ExpectedLoads.of(self.superelement, self.shares)
 
     def outside(self, points: Tensor) -> Tensor:
         """True for points (..., 3) well beyond the implant's ends, where its end sections' motion goes on."""
         sections = self.superelement.sections
-        height = points.double() @ sections.axis
+        height = self.rested(points.double()) @ sections.axis
         return (height < sections.heights[0] - _BEYOND_MM) | (height > sections.heights[-1] + _BEYOND_MM)
 
     def prior(self, amounts: Tensor) -> Tensor:
@@ -119,20 +136,23 @@ class FiniteElementDeformation(Deformation):
         """Force and moment at each hold, (H, 6), N and N mm, in the implant's axes."""
         return torch.einsum("a,ahk->hk", self.amounts.detach(), self.expected.loads_of(self.superelement))
 
+    @torch.no_grad()
+    def reset(self) -> None:
+        """Takes all loads away; what was bent before stays so."""
+        self.amounts.zero_()
+
     def to_dict(self) -> dict[str, Any]:
-        """Superelement and amounts."""
-        content = self.superelement.to("cpu").to_dict()
-        amounts = self.amounts.detach().cpu()
-        covariance = None if self.covariance is None else self.covariance.cpu()
-        return {
+        """Superelement, amounts and rest shape."""
+        content: dict[str, Any] = {
             "model": self.model,
-            "amounts": amounts,
-            "covariance": covariance,
+            "amounts": self.amounts.detach().cpu(),
+            "covariance": None if self.covariance is None else self.covariance.cpu(),
             "load_weight": self.load_weight,
             "unused": self.unused,
             "shares": self.shares.cpu(),
-            "superelement": content,
+            "superelement": self.superelement.to("cpu").to_dict(),
         }
+        return content if self.rest is None else content | {"rest": self.rest.to_dict()}
 
 
 class FiniteElementMotion(Motion):
@@ -165,10 +185,12 @@ class FiniteElementMotion(Motion):
             self.deformation.weight.fill_(loss)
 
     def features(self, points: Tensor) -> Tensor:
-        """Those of the sections (4 S), then each way's remainder (3 A)."""
+        """Those of the sections (4 S), then each way's remainder (3 A), then how far points had moved without load."""
         points, element = points.double(), self.deformation.superelement
-        rest = element.remainder(points, torch.eye(element.num_amounts, dtype=points.dtype, device=points.device))
-        return torch.cat([section_features(element, points), rest.permute(1, 0, 2).flatten(1)], dim=-1)
+        with torch.no_grad():
+            rested = self.deformation.rested(points)
+        left = element.remainder(rested, torch.eye(element.num_amounts, dtype=points.dtype, device=points.device))
+        return torch.cat([section_features(element, rested), left.permute(1, 0, 2).flatten(1), rested - points], dim=-1)
 
     def coefficients(self, steps: Tensor) -> Tensor:
         """Motions of the sections, then amounts, turned and shifted as a whole."""
@@ -177,7 +199,9 @@ class FiniteElementMotion(Motion):
         center = self.whole.center.to(turn)
         shift = center + shift - (turn @ center[:, None])[..., 0]
         sections = section_coefficients(self.deformation.superelement, amounts, turn, shift)
-        return torch.cat([sections, (amounts[..., None, None] * turn[:, None].mT).flatten(1, 2)], dim=1)
+        left = (amounts[..., None, None] * turn[:, None].mT).flatten(1, 2)
+        same = torch.eye(3, dtype=turn.dtype, device=turn.device).expand_as(turn)
+        return torch.cat([sections, left, same], dim=1)
 
     def penalty(self, steps: Tensor) -> Tensor:
         """The deformation's prior."""
@@ -190,11 +214,13 @@ class FiniteElementMotion(Motion):
         return self.whole.accept(steps[:6])
 
     def keep_covariance(self, covariance: Tensor) -> None:
-        """That of the amounts; those that were not free have what the prior expects."""
+        """That of the amounts, rest shape included; those that were not free have what the prior expects."""
         free = self.whole.num_parameters
         whole = torch.diag(1 / self.precisions)
         whole[: self.num_free, : self.num_free] = covariance[free:, free:].to(whole)
-        self.deformation.covariance = self.all_ways @ whole @ self.all_ways.T
+        spread = self.deformation.rest_spread
+        whole = self.all_ways @ whole @ self.all_ways.T
+        self.deformation.covariance = whole if spread is None else whole + spread.to(whole)
 
     def _amounts(self, steps: Tensor) -> Tensor:
         return self.start.to(steps) + steps[:, self.whole.num_parameters :] @ self.ways.T.to(steps)

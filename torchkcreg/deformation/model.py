@@ -113,6 +113,10 @@ class Deformation(nn.Module, ABC):
         moved = self.forward(sides).unflatten(0, (3, 2))
         return ((moved[:, 0] - moved[:, 1]) / (2 * step)).movedim(0, -1)
 
+    def strained(self, points: Tensor) -> Tensor:
+        """Jacobians (..., N, 3, 3) at points (..., N, 3) against the implant's shape without load: what strains it."""
+        return self.jacobian(points)
+
     def jacobian_determinant(self, points: Tensor) -> Tensor:
         """Local volume ratio of the deformation at points (..., N, 3), shape (..., N); it folds where negative."""
         return torch.linalg.det(self.jacobian(points))

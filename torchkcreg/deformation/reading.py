@@ -48,6 +48,7 @@ def _finite_elements(content: dict[str, Any]) -> FiniteElementDeformation:
         unused=float(content.get("unused", 1.0)),
         shares=None if shares is None else finite_array(shares, (len(superelement.holds),), "shares"),
         covariance=None if covariance is None else finite_array(covariance, (number, number), "covariance"),
+        rest=deformation_from_dict(content["rest"]) if content.get("rest") is not None else None,
     )
 
 

@@ -9,21 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import transform_points
-from torchkcreg.implant import Component, ImplantPointCloud, find_holes
 from torchkcreg.io import (
     implausible_magnification,
-    read_components,
     read_geometry,
-    read_init,
-    read_mesh,
     read_projections,
-    read_run,
     read_spectrum,
 )
 from torchkcreg.kernels import choose_backend
@@ -31,8 +24,8 @@ from torchkcreg.physics import Spectrum, material
 from torchkcreg.registration import Implant, RegistrationConfig
 from torchkcreg.scene import RegistrationData
 
-_FEWEST_NODES_ALONG = 4
-_SAME_FRAME_MM = 5.0  # by which bounds of one implant may differ: nodes do not reach its surface
+from .implant_files import ImplantFiles, read_implant
+
 _FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
 
 
@@ -47,6 +40,7 @@ class RegistrationFiles:
         spectrum: Detected spectrum; None takes a 90 kV tungsten spectrum where a material is named.
         components: Screws that move with the implant.
         init: Approximate pose, or the run folder of another registration of the implant.
+        rest: Run folder of a registration of the implant without load: finite elements bend it from that shape.
         materials: Of each of several implants, where they are not of one.
         views: Views to use; None takes all.
         open_beam: Unattenuated intensity where the projections' file does not say it.
@@ -59,6 +53,7 @@ class RegistrationFiles:
     spectrum: Path | None = None
     components: Path | Sequence[Path | None] | None = None
     init: Path | Sequence[Path | None] | None = None
+    rest: Path | Sequence[Path | None] | None = None
     materials: Sequence[str] | None = None
     views: list[int] | None = None
     open_beam: float | None = None
@@ -82,21 +77,11 @@ class RegistrationFiles:
                 meshes,
                 _for_each(self.components, len(meshes), "components"),
                 _for_each(self.init, len(meshes), "init"),
+                _for_each(self.rest, len(meshes), "rest"),
                 _for_each(self.materials, len(meshes), "material"),
                 strict=True,
             )
         ]
-
-
-@dataclass(frozen=True)
-class ImplantFiles:
-    """The files of one implant, see :class:`RegistrationFiles`."""
-
-    name: str
-    mesh: Path
-    components: Path | None
-    init: Path | None
-    material: str | None
 
 
 def _for_each(given: Any, number: int, what: str) -> list[Any]:
@@ -152,44 +137,6 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
     return RegistrationInputs(implants, data, spectrum, notes)
 
 
-def read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
-    """One implant of a registration.
-
-    Raises:
-        ValueError: If a file is malformed.
-        FileNotFoundError: If a file is missing.
-    """
-    screws = read_components(files.components) if files.components else []
-    mesh = read_mesh(files.mesh)
-    pose = _start_pose(files, mesh)
-    _check_size(files.mesh, mesh, config.pitch_mm)
-    return Implant(
-        ImplantPointCloud.from_mesh(mesh, config.pitch_mm),
-        components=[Component.of(screw, pitch=config.pitch_mm) for screw in screws],
-        holes=find_holes(mesh),
-        implant_to_world=pose,
-        material=files.material,
-        name=files.name,
-    )
-
-
-def _start_pose(files: ImplantFiles, mesh: trimesh.Trimesh) -> Tensor | None:
-    """A pose out of a file, or that of the same implant in the run folder of another registration."""
-    if files.init is None or not files.init.is_dir():
-        return read_init(files.init) if files.init else None
-    implants = read_run(files.init).implants
-    implant = next((i for i in implants if i.name == files.name), implants[0])
-    if implant.deviations is not None:
-        nodes, bounds = implant.deviations.points, torch.from_numpy(np.array(mesh.bounds))
-        off = float((torch.stack([nodes.amin(0), nodes.amax(0)]) - bounds).abs().max())
-        if off > _SAME_FRAME_MM:
-            raise ValueError(
-                f"the implant of run folder {files.init} reaches up to {off:.0f} mm further than {files.mesh}: another "
-                "implant, or another frame"
-            )
-    return implant.implant_to_world
-
-
 def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:
     choose_backend(_device(config.device), config.backend)
     if config.material is not None:
@@ -229,14 +176,6 @@ def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> Registra
         rows, cols = geometry.det_shape
         raise ValueError(f"the detector has {rows} x {cols} pixels, too few for a stage that bins {largest} into one")
     return RegistrationData(geometry, projections.line_integrals, projections.mask)
-
-
-def _check_size(path: Path, mesh: trimesh.Trimesh, pitch_mm: float) -> None:
-    if mesh.extents.max() < _FEWEST_NODES_ALONG * pitch_mm:
-        size = " x ".join(f"{extent:.3g}" for extent in mesh.extents)
-        raise ValueError(
-            f"the implant in {path} is {size} mm, too small for nodes {pitch_mm:g} mm apart: is the mesh in metres?"
-        )
 
 
 @contextmanager

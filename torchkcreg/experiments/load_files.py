@@ -102,12 +102,14 @@ def load_files(
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     points = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     known = own.expected.covariance if covariance is None else covariance
-    stress, std = node_stresses(element, points, amounts, known)
+    rested = own.rested(points)
+    stress, std = node_stresses(element, rested, amounts, known)
     worst, limit = int(stress.argmax()), element.constants.yield_stress
     if float(stress[worst]) > limit:
         warnings.append(
             f"stress reaches {float(stress[worst]):.0f} MPa, more than the {limit:.0f} MPa where the alloy yields: the "
-            "implant was bent before or beyond this load; --against a run without load takes that out"
+            "implant was bent before or beyond this load; a run without load takes that out: load --against it, or "
+            "register --rest"
         )
     found = ImplantLoad(
         CarriedLoad.of(element, amounts, covariance, own.expected),
@@ -125,7 +127,7 @@ def load_files(
     write_surface_vtu(out / "load.vtu", placed, values)
     if figures:
         title = f"what the {registered.name} carries"
-        figure = load_figure(found.carried, points, stress, yield_stress=limit, title=title)
+        figure = load_figure(found.carried, rested, stress, yield_stress=limit, title=title)
         write_figure(out / "load.png", figure)
     return found
 

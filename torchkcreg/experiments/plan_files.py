@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.experiments.inputs import ImplantFiles, read_implant
+from torchkcreg.experiments.implant_files import ImplantFiles, read_implant
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.io import read_geometry, read_spectrum, write_figure, write_json, write_text
 from torchkcreg.plain import plain
@@ -109,7 +109,7 @@ def plan_files(
     if every < 1 or most < 2:
         raise ValueError(f"every must be at least 1 and most at least 2, got {every} and {most}")
     config = RegistrationConfig(material=material)
-    placed = read_implant(ImplantFiles("implant", implant, components, init, None), config)
+    placed = read_implant(ImplantFiles("implant", implant, components, init), config)
     scene = build_scene(placed, config, spectrum=read_spectrum(spectrum) if spectrum is not None else None)
     views = read_geometry(geometry)
     chosen = list(range(0, views.num_views, every))

@@ -142,14 +142,21 @@ class Superelement:
             amounts: Shape (K, A).
         """
         points, amounts = points.double(), amounts.to(self.nodal)
+        there, whole = self._interpolated(points, amounts)
+        shifts, turns = (torch.einsum("ka,asi->ksi", amounts, ways) for ways in (self.shifts, self.turns))
+        return whole - self.sections.blended(there, shifts, turns)
+
+    def linear(self, points: Tensor, amounts: Tensor) -> Tensor:
+        """Linear displacements (K, P, 3) for amounts (K, A) at points (P, 3), mm; beside it, of the nearest edge."""
+        return self._interpolated(points.double(), amounts.to(self.nodal))[1]
+
+    def _interpolated(self, points: Tensor, amounts: Tensor) -> tuple[Tensor, Tensor]:
+        """The places (P, 3) in the cubes nearest to points, and the linear displacements (K, P, 3) there."""
         cube, inside = self.hexahedra.locate(points)
         held = inside.clamp(-1, 1)
         there = points + (held - inside) @ self.hexahedra.frame[:3, :3].mT * (self.hexahedra.edge / 2)
-        nodal, shifts, turns = (
-            torch.einsum("ka,ani->kni", amounts, ways) for ways in (self.nodal, self.shifts, self.turns)
-        )
-        whole = interpolated(self.hexahedra, nodal, cube, held)
-        return whole - self.sections.blended(there, shifts, turns)
+        nodal = torch.einsum("ka,ani->kni", amounts, self.nodal)
+        return there, interpolated(self.hexahedra, nodal, cube, held)
 
     def stress(self, points: Tensor, amounts: Tensor) -> Tensor:
         """Stresses (P, 3, 3) at points (P, 3) of the undeformed implant, N/mm^2, in its axes."""

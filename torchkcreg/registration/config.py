@@ -120,7 +120,7 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
         Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen),
         Stage(groups=2, bin=2, before=after_others, **fine),
         Stage(**finest, bin=2, before=after_others, **fine),
-        Stage(**finest, bin=1, before=(*after_others, *weighed), **fine),
+        Stage(**finest, bin=1, before=("align", *after_others, *weighed), **(fine | {"estimate": (*every, "views")})),
     ]
     if preset == "paper":
         evolve = {"optimizer": "cmaes", "iterations": 400, "population": 40}
@@ -186,6 +186,9 @@ class RegistrationConfig(Config):
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp" or "torch".
+        view_motion: Whether views may have stood otherwise than the geometry has it: "off", "on", or "auto" where the
+            images ask for it.
+        view_motion_mm: How far, standard deviation along each axis, mm; as far by rotation.
         device: Where files are registered: "cpu", "cuda", "cuda:1", ...; in Python the data's own device decides.
     """
 
@@ -216,6 +219,8 @@ class RegistrationConfig(Config):
     seed: int = 0
     backend: str = "auto"
     device: str = "cpu"
+    view_motion: Literal["off", "on", "auto"] = "off"
+    view_motion_mm: float = Field(0.2, gt=0)
 
     @field_validator("stages")
     @classmethod

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
-from torchkcreg.deformation import Deformation, FiniteElementDeformation, FreeFormDeformation
+from torchkcreg.deformation import (
+    Deformation,
+    FiniteElementDeformation,
+    FreeFormDeformation,
+    bent_cloud,
+    bent_hold,
+    spread_of_rest,
+)
 from torchkcreg.implant import Component, Hole, ImplantPointCloud
 from torchkcreg.mechanics import Hold, LoadPrior, Superelement, holds_of
 from torchkcreg.physics import elastic_constants, is_elastic
 from torchkcreg.splines import default_grid
 
 from .config import RegistrationConfig
+from .registered_implant import RegisteredImplant
 
 
 @dataclass(frozen=True)
@@ -28,7 +37,8 @@ class Implant:
         implant_to_world: Approximate pose (4, 4); the identity when None.
         material: Name of its material; that of the options when None.
         name: How results refer to it.
-        holds: Where finite elements are loaded, in place of the holes, with screws or without.
+        holds: Where finite elements are loaded in place of the holes of the undeformed implant, with screws or without.
+        rest: The implant as it was registered without load: finite elements bend it from that shape.
     """
 
     cloud: ImplantPointCloud
@@ -38,6 +48,7 @@ class Implant:
     material: str | None = None
     name: str = "implant"
     holds: Sequence[Hold] = ()
+    rest: RegisteredImplant | None = None
 
 
 DeformationFactory = Callable[[Implant, RegistrationConfig], Deformation]
@@ -47,12 +58,15 @@ def deformation_of(implant: Implant, config: RegistrationConfig) -> Deformation:
     """The deformation that a configuration describes; "auto": finite elements where the stiffness is known.
 
     Raises:
-        ValueError: If finite elements are asked for an implant whose material is not said, or has no known stiffness.
+        ValueError: If finite elements are asked for an implant whose material is not said, or has no known stiffness;
+            if another model is asked for one whose shape without load is given.
     """
     material = implant.material or config.material
     known = material is not None and is_elastic(material)
     if config.deformation == "fe" or (config.deformation == "auto" and known):
         return finite_elements(implant, config)
+    if implant.rest is not None:
+        raise ValueError("a shape without load is what finite elements bend: ask for them with --deformation fe")
     grid = default_grid(implant.cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
     return FreeFormDeformation(grid, prior=config.bending_prior)
 
@@ -63,13 +77,20 @@ def finite_elements(implant: Implant, config: RegistrationConfig) -> FiniteEleme
     if material is None:
         raise ValueError("finite elements need the implant's material: give --material, or Implant.material")
     cloud = implant.cloud.to("cpu")
-    superelement = Superelement.of(
-        cloud,
-        elastic_constants(material),
-        implant.holds or holds_of(cloud, implant.holes),
-        prior=LoadPrior(config.hold_force_n, config.hold_moment_nmm),
-    )
+    holds = implant.holds or holds_of(cloud, implant.holes)
+    if implant.rest is not None:
+        shape = implant.rest.deformation
+        cloud, holds = bent_cloud(cloud, shape), [bent_hold(hold, shape) for hold in holds]
+    prior = LoadPrior(config.hold_force_n, config.hold_moment_nmm)
+    superelement = Superelement.of(cloud, elastic_constants(material), holds, prior=prior)
     unused = 1.0 if implant.holds else config.hold_unused
-    if config.hold_weight is None:
-        return FiniteElementDeformation(superelement, weighed=True, unused=unused)
-    return FiniteElementDeformation(superelement, load_weight=config.hold_weight, unused=unused)
+    known = {"weighed": True} if config.hold_weight is None else {"load_weight": config.hold_weight}
+    return FiniteElementDeformation(superelement, unused=unused, **known, **_rest(implant.rest, superelement))
+
+
+def _rest(rest: RegisteredImplant | None, element: Superelement) -> dict[str, Any]:
+    if rest is None:
+        return {}
+    doubt = rest.deviations
+    spread = None if doubt is None else spread_of_rest(element, rest.deformation, doubt, rest.implant_to_world)
+    return {"rest": rest.deformation, "rest_spread": spread}

@@ -113,7 +113,10 @@ class Objective:
 
     def uncertainty(self, parameters: Tensor) -> Uncertainty:
         """How sure the images are of parameters (D,) near the optimum."""
-        jacobian, residuals = self.jacobian(parameters)
+        return self.uncertainty_from(*self.jacobian(parameters), parameters)
+
+    def uncertainty_from(self, jacobian: Tensor, residuals: Tensor, parameters: Tensor) -> Uncertainty:
+        """How sure the images are where the derivatives of the residuals are known, see :meth:`jacobian`."""
         pixel = self.view.geometry.pixel_spacing[1]
         first = self.scene.assemblies[0].nodes()
         return Uncertainty.of(

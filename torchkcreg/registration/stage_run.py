@@ -150,6 +150,7 @@ class StageRun:
             estimate=stage.estimate,
             screws="screws" in stage.estimate,
             tilts="tilts" in stage.estimate,
+            views="views" in stage.estimate,
             prior_weight=self.config.prior_weight,
         )
         return Objective(self.scene, view, moves, self.similarity(), penalties=self.terms.penalties)

@@ -9,15 +9,17 @@ from typing import Any
 
 import torch
 
-from torchkcreg.scene import Assembly
+from torchkcreg.scene import Assembly, ViewMotions
 
+from .align import view_evidence
 from .basins import places
 from .config import Stage
 from .screws import find_screws, of_best_metal, screws_by_metal
-from .stage_run import StageRun, Step
+from .stage_run import StageRun, Step, changed
 from .verdict import Rival
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
+_ALIGN_BIN = 2  # views that moved need no finer pixels
 _LOOKS = ("find_screws", "choose_screws")
 
 
@@ -70,6 +72,25 @@ def weigh(run: StageRun) -> None:
         block.weigh(loss)
 
 
+def align(run: StageRun) -> None:
+    """Lets views move from now on, if they may and the images ask for it: that explains more than chance would."""
+    config, scene = run.config, run.scene
+    if config.view_motion == "off" or scene.view_motions is not None:
+        return
+    nodes = torch.cat([assembly.nodes() for assembly in scene])
+    scene.view_motions = ViewMotions(nodes, run.data.num_views, config.view_motion_mm)
+    probe = changed(run, bin=max(run.stage.bin, _ALIGN_BIN))
+    probe.with_background()
+    probe.objective = probe.objective.reweighted()
+    found = view_evidence(probe.objective)
+    if config.view_motion == "auto" and not found.is_strong:
+        scene.view_motions = None
+        return
+    probe.optimize()
+    probe.accept(probe.begin().best())
+    run.renew()
+
+
 def slide(run: StageRun) -> None:
     """Tries the implants all along their long axes, and stays where the rigid stages explain the images best."""
     candidates = places(run.objective, run.begin().best())
@@ -108,9 +129,10 @@ def _with_holes(run: StageRun) -> list[Assembly]:
 BEFORE: dict[str, Step] = {
     "find_screws": find,
     "choose_screws": choose,
+    "align": align,
     "background": estimate_background,
     "reweight": reweight,
     "weigh": weigh,
 }
 AFTER: dict[str, Step] = {"slide": slide}
-CHANGE_SCENE = _LOOKS  # of the steps before an optimiser: a checkpoint within a stage has what they did
+CHANGE_SCENE = (*_LOOKS, "align")  # of the steps before an optimiser: a checkpoint within a stage has what they did

@@ -92,7 +92,7 @@ class Trainer:
             if stage.optimizer not in OPTIMIZERS and self.terms.optimizer is None:
                 raise ValueError(f"optimizer must be one of {', '.join(OPTIMIZERS)}, got {stage.optimizer!r}")
             free = self.scene.intensity.free
-            known = {"screws", "tilts", *(free or PHYSICS)}  # plain path lengths leave physics out
+            known = {"screws", "tilts", "views", *(free or PHYSICS)}  # plain path lengths leave physics out
             if unknown := sorted(set(stage.estimate) - known):
                 raise ValueError(f"{unknown[0]!r} cannot be estimated: {', '.join(sorted(known))} can")
 

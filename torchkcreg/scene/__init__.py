@@ -10,6 +10,7 @@ from .saved import scene_from_dict, scene_to_dict
 from .scene import Scene
 from .state import Placement, State
 from .view import View
+from .view_motions import ViewMotions, ViewMotionSteps
 
 __all__ = [
     "Assembly",
@@ -20,6 +21,8 @@ __all__ = [
     "Scene",
     "State",
     "View",
+    "ViewMotionSteps",
+    "ViewMotions",
     "followed_motion",
     "scene_from_dict",
     "scene_to_dict",

@@ -139,7 +139,7 @@ class Assembly(ExactModule):
     def rms_strain(self) -> float:
         """Root mean square of the strain in the implant."""
         cloud = self.implant.coarsened_to(_NODES_PITCH_MM)
-        gradients = self.deformation.jacobian(cloud.points.double())
+        gradients = self.deformation.strained(cloud.points.double())
         strain = 0.5 * (gradients.mT @ gradients - torch.eye(3, dtype=gradients.dtype, device=gradients.device))
         share = (cloud.volumes / cloud.volumes.sum()).double()
         return float((strain.square().sum((-2, -1)) * share).sum().sqrt())

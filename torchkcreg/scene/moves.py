@@ -20,6 +20,7 @@ from .screw_shapes import ScrewShapes
 from .state import State
 from .tilts import ComponentTilts
 from .view import View
+from .view_motions import ViewMotionSteps
 
 _SCREW_PITCH_MM = 0.5
 _DIFFERENCE_MM = 1e-3
@@ -37,6 +38,7 @@ class Moves(ParameterBlocks):
         estimate: Parameters of the intensity model that are estimated along.
         screws: Lengths and radii of found screws are, too.
         tilts: Components may turn a little about their heads.
+        views: Views may move, if the scene has motions of views.
         prior_weight: Loss for a parameter of the intensity model, or a tilt, that is a standard deviation off.
     """
 
@@ -49,6 +51,7 @@ class Moves(ParameterBlocks):
         estimate: Sequence[str] = (),
         screws: bool = False,
         tilts: bool = False,
+        views: bool = False,
         prior_weight: float = 0.0,
     ) -> None:
         self.scene, self.view = scene, view
@@ -65,6 +68,9 @@ class Moves(ParameterBlocks):
             if tilts and len(part.assembly.components):
                 part.tilts = ComponentTilts(part.assembly, prior_weight)
                 blocks[f"tilts of {part.name}"] = part.tilts
+        self.views = None
+        if views and scene.view_motions is not None:
+            self.views = blocks["views"] = ViewMotionSteps(scene.view_motions)
         super().__init__(blocks)
 
     def state(self, parameters: Tensor) -> State:
@@ -78,7 +84,8 @@ class Moves(ParameterBlocks):
             if part.shapes:
                 for name, path in part.shapes.added(steps[f"screws of {part.name}"]).items():
                     added[name] = path if name not in added else added[name] + path
-        return State(tuple(placements), self.physics.arguments(steps["physics"]), added)
+        views = None if self.views is None else self.views.motions(steps["views"])
+        return State(tuple(placements), self.physics.arguments(steps["physics"]), added, views)
 
     def displacements(self, parameters: Tensor) -> Tensor:
         """Displacements (K, S) of all implants' nodes, so weighted that their squares sum to the mean square, mm^2."""
@@ -126,6 +133,8 @@ class Moves(ParameterBlocks):
         for part in self.parts:
             part.accept(steps)
         self.physics.accept(steps["physics"])
+        if self.views is not None:
+            self.views.accept(steps["views"])
 
 
 class _Part:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from .assembly import Assembly
 from .data import RegistrationData
 from .state import State
 from .view import View
+from .view_motions import ViewMotions
 
 
 class Scene(nn.Module):
@@ -29,6 +31,9 @@ class Scene(nn.Module):
         metals: Names of materials that screws found in the implants' holes may be of, besides the implants' own.
         materials: Names in the order of the path lengths; those of implants, metals and components when None.
         backend: Of the projector: "auto", "cpp" or "torch".
+
+    Attributes:
+        view_motions: How the scene stood in each measured view against where the geometry has it; None: as it has it.
 
     >>> import trimesh
     >>> from torchkcreg.deformation import RigidDeformation
@@ -62,6 +67,7 @@ class Scene(nn.Module):
             raise ValueError(f"implants must have names of their own, got {', '.join(names)}")
         self.assemblies = nn.ModuleList(assemblies)  # type: ignore[assignment]
         self.intensity = IdentityIntensity() if intensity is None else intensity
+        self.view_motions: ViewMotions | None = None
         self.metals, self.backend = list(metals), backend
         own = [a.material for a in assemblies]
         parts = [c.material for a in assemblies for c in a.components]
@@ -73,7 +79,12 @@ class Scene(nn.Module):
         return iter(self.assemblies)
 
     def view(self, data: RegistrationData | ConeBeamGeometry, **scale: Any) -> View:
-        """What is seen of the scene near its present state; see :class:`View` for ``scale``."""
+        """What is seen of the scene near its present state; see :class:`View` for ``scale``.
+
+        Measured images are seen as the scene stood in each of their views; a geometry alone is taken as it is.
+        """
+        if self.view_motions is not None and isinstance(data, RegistrationData):
+            data = replace(data, geometry=self.view_motions.corrected(data.geometry))
         return View(list(self.assemblies), self.materials, data, backend=self.backend, **scale)
 
     def state(self, view: View) -> State:
@@ -88,7 +99,7 @@ class Scene(nn.Module):
         """
         view = self.view(view) if isinstance(view, ConeBeamGeometry) else view
         state = self.state(view) if state is None else state
-        paths = view.path_lengths(state.placements, len(self.materials))
+        paths = view.path_lengths(state.placements, len(self.materials), state.views)
         for name, added in state.added.items():
             index = self.materials.index(name)
             paths[index] = paths[index] + added
@@ -130,6 +141,7 @@ class Scene(nn.Module):
         return {
             "assemblies": [assembly.kept() for assembly in self.assemblies],
             "intensity": {name: value.detach().clone() for name, value in self.intensity.named_parameters()},
+            "view_motions": None if self.view_motions is None else self.view_motions.kept(),
         }
 
     @torch.no_grad()
@@ -139,6 +151,8 @@ class Scene(nn.Module):
             assembly.restore(state)
         for name, value in self.intensity.named_parameters():
             value.copy_(kept["intensity"][name])
+        views = kept.get("view_motions")
+        self.view_motions = None if views is None else ViewMotions.of_kept(views)
 
     def description(self) -> dict[str, list[float]]:
         """What tells a registration of this scene from one of another, as plain numbers."""

@@ -29,8 +29,10 @@ class State:
         placements: Of each assembly, in the scene's order.
         physics: Arguments of the intensity model, each of shape (K,), the blur in the rendered pixels.
         added: What is added to the path lengths of a material, by its name, (K, V, rows, cols), mm.
+        views: Motions (K, V, 4, 4) of the world before it is projected in each view; none when None.
     """
 
     placements: tuple[Placement, ...]
     physics: Mapping[str, Tensor] = field(default_factory=dict)
     added: Mapping[str, Tensor] = field(default_factory=dict)
+    views: Tensor | None = None

@@ -143,22 +143,38 @@ class View:
         """Nodes of all materials."""
         return sum(len(body.volumes) for body in self.bodies)
 
-    def path_lengths(self, placements: Sequence[Placement], num_materials: int) -> list[Tensor]:
-        """Path lengths (K, V, rows, cols) of each material on the rendered pixels, mm."""
+    def path_lengths(
+        self, placements: Sequence[Placement], num_materials: int, views: Tensor | None = None
+    ) -> list[Tensor]:
+        """Path lengths (K, V, rows, cols) of each material on the rendered pixels, mm.
+
+        Args:
+            placements: Of K candidates, of each assembly.
+            num_materials: How many there are.
+            views: Motions (K, V, 4, 4) of the world before it is projected in each view.
+        """
         shape = (len(placements[0].nodes), len(self.matrices), *self.fine.det_shape)
         paths = [self.matrices.new_zeros(()).expand(shape) for _ in range(num_materials)]
         for body in self.bodies:
-            drawn = project_points(
-                body.points(placements),
-                body.volumes,
-                self.matrices,
-                self.fine.det_shape,
-                footprint=body.footprint,
-                backend=self.backend,
-            )
+            drawn = self._drawn(body, body.points(placements), views)
             first = all(other is body or other.material != body.material for other in self.bodies)
             paths[body.material] = drawn if first else paths[body.material] + drawn
         return paths
+
+    def _drawn(self, body: _Body, points: Tensor, views: Tensor | None) -> Tensor:
+        """Path lengths (K, V, rows, cols) of a body at points (K, N, 3)."""
+        if views is not None:  # what moves otherwise in every view is projected view by view
+            alone = [
+                self._projected(body, transform_points(motion.to(points), points), slice(view, view + 1))
+                for view, motion in enumerate(views.unbind(1))
+            ]
+            return torch.cat(alone, dim=1)
+        return self._projected(body, points, slice(None))
+
+    def _projected(self, body: _Body, points: Tensor, views: slice) -> Tensor:
+        footprint = Footprint(body.footprint.table[views], body.footprint.block_size)
+        matrices, shape = self.matrices[views], self.fine.det_shape
+        return project_points(points, body.volumes, matrices, shape, footprint=footprint, backend=self.backend)
 
     def cloud_path_lengths(self, cloud: ImplantPointCloud, motion: Tensor) -> Tensor:
         """Path lengths (V, rows, cols) in mm of a cloud, moved by (4, 4) into the world, on the rendered pixels."""
