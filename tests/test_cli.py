@@ -126,7 +126,7 @@ def test_finite_elements_bend_an_implant_from_the_shape_of_an_earlier_run(small_
     out = tmp_path / "run"
     asked = command(small_case, out, rest=finished, material="steel", deformation="modes")
     assert "--deformation fe" in rejected(asked, out, capsys)
-    assert "no finished" in rejected(command(small_case, out, rest=tmp_path, deformation="fe"), out, capsys)
+    assert "is no run" in rejected(command(small_case, out, rest=tmp_path, deformation="fe"), out, capsys)
 
 
 def test_plan_ranks_views_without_any_image(small_case, tmp_path, capsys):

@@ -30,7 +30,8 @@ FLOORS = {
     "evaluation": 7,
     "visualization": 8,
     "experiments": 9,
-    "cli": 10,
+    "studies": 10,
+    "cli": 11,
 }
 MOST_LEVELS = 6
 FOLDERS = sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file())

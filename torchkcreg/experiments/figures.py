@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -41,7 +42,8 @@ def draw_registration(
     """
     if result.scene is None:
         raise ValueError("the result has no scene to draw: it was read from files")
-    figures = {"overlay.png": _overlay(result, result.scene, data, starts)}
+    data = replace(data, geometry=result.corrected(data.geometry))
+    figures = {"overlay.png": _overlay(result, _as_told(result.scene), data, starts)}
     for number, assembly in enumerate(result.scene):
         prefix = f"{assembly.name}_" if number else ""
         figures[f"{prefix}displacement.png"] = _displacement(result.implants[number], assembly)
@@ -65,6 +67,15 @@ def start_scene(scene: Scene, starts: Sequence[Tensor]) -> Scene:
             assembly.deformation.reset()
             assembly.implant_to_world.copy_(pose)
     return start
+
+
+def _as_told(scene: Scene) -> Scene:
+    """The scene for a geometry that is right: a copy, if it has motions of views."""
+    if scene.view_motions is None:
+        return scene
+    bare = copy.deepcopy(scene)
+    bare.view_motions = None
+    return bare
 
 
 def _overlay(result: RegistrationResult, scene: Scene, data: RegistrationData, starts: Sequence[Tensor]) -> Figure:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import transform_points
-from torchkcreg.io import RunFolder, read_config
+from torchkcreg.io import RunFolder, read_config, write_geometry
 from torchkcreg.registration import (
     Callback,
     Progress,
@@ -131,6 +131,8 @@ def write_run(
     if figures:
         for name, figure in draw_registration(result, trainer.data, starts).items():
             run.write_figure(name, figure)
+    if result.view_motions is not None:
+        write_geometry(run.path / "geometry_corrected.json", result.corrected(trainer.data.geometry))
     run.write_result(result, [implant.cloud.points for implant in inputs.implants], initial_to_world=starts)
 
 

@@ -219,7 +219,7 @@ class RegistrationConfig(Config):
     seed: int = 0
     backend: str = "auto"
     device: str = "cpu"
-    view_motion: Literal["off", "on", "auto"] = "off"
+    view_motion: Literal["off", "on", "auto"] = "auto"
     view_motion_mm: float = Field(0.2, gt=0)
 
     @field_validator("stages")

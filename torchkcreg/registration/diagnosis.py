@@ -68,6 +68,7 @@ def diagnose(
         at_bounds=objective.moves.at_bounds(_AT_BOUND),
         undone=dict(undone),
         rival=rival,
+        view_motion_mm=None if scene.view_motions is None else scene.view_motions.rms_mm,
         screws_found=sum(len(assembly.found) for assembly in scene),
     )
     return found, deviations

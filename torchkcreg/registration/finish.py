@@ -57,6 +57,7 @@ def finished(
         warnings=reasons,
         diagnostics=asdict(found),
         intensity={name: float(value.detach()) for name, value in scene.intensity.named_parameters()},
+        view_motions=None if scene.view_motions is None else scene.view_motions.matrices(),
         scene=scene,
     )
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.physics import Beam, PolyenergeticTransmission, scattered_signal
-from torchkcreg.plain import finite_number, require_keys
+from torchkcreg.plain import finite_array, finite_number, require_keys
 from torchkcreg.scene import RegistrationData, Scene, scene_from_dict, scene_to_dict
 
 from .config import RegistrationConfig
@@ -40,6 +40,8 @@ class RegistrationResult(RegisteredImplants):
             error of the implant's nodes.
         stages: One record a stage: iterations, converged, loss, undone.
         intensity: Estimated parameters of the intensity model.
+        view_motions: Rigid motions (V, 4, 4) of the world before it was projected in each view, ``P_v T_v``, where they
+            were found to be other than the geometry has it; None where the geometry is as it was told.
         scene: The scene as it was registered; None for one that was read from a run folder.
     """
 
@@ -53,7 +55,12 @@ class RegistrationResult(RegisteredImplants):
     diagnostics: dict[str, Any] = field(default_factory=dict)
     stages: list[dict[str, Any]] = field(default_factory=list)
     intensity: dict[str, float] = field(default_factory=dict)
+    view_motions: Tensor | None = None
     scene: Scene | None = field(default=None, repr=False)
+
+    def corrected(self, geometry: ConeBeamGeometry) -> ConeBeamGeometry:
+        """The geometry of the registered views as they were found to be; what was told where it held."""
+        return geometry if self.view_motions is None else geometry.moved(self.view_motions)
 
     @torch.no_grad()
     def project(self, geometry: ConeBeamGeometry) -> Tensor:
@@ -95,6 +102,7 @@ class RegistrationResult(RegisteredImplants):
         if self.scene is not None:
             self.scene.to(device)
         self.gc, self.implants = self.gc.to(device), [implant.to(device) for implant in self.implants]
+        self.view_motions = None if self.view_motions is None else self.view_motions.to(device)
         return self
 
     def _scene(self) -> Scene:
@@ -154,6 +162,7 @@ class RegistrationResult(RegisteredImplants):
             "warnings": self.warnings,
             "diagnostics": self.diagnostics,
             "stages": self.stages,
+            "view_motions": self.view_motions,
             "config": self.config.model_dump(mode="json"),
         }
 
@@ -183,6 +192,7 @@ class RegistrationResult(RegisteredImplants):
             history=list(history or []),
             config=RegistrationConfig.model_validate(content["config"]),
             seed=int(content.get("seed", 0)),
+            view_motions=_motions(content.get("view_motions")),
             status=content.get("status", "ok"),
             diagnostics=dict(content.get("diagnostics", {})),
             stages=list(content.get("stages", [])),
@@ -200,3 +210,10 @@ class RegistrationResult(RegisteredImplants):
         expected = "" if deviation is None else f", expected error {deviation:.3f} mm"
         text = f"RegistrationResult({self.status}: {names}, gc {gc}{expected})"
         return "\n".join([text, *(f"  {warning}" for warning in self.warnings)])
+
+
+def _motions(content: Any) -> Tensor | None:
+    if content is None:
+        return None
+    number = len(content) if isinstance(content, (list, Tensor)) else 0
+    return finite_array(content, (number, 4, 4), "view_motions")

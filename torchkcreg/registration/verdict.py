@@ -52,6 +52,8 @@ class Diagnostics:
         surprise: Mean square of what the deformation's prior was told of, in its standard deviations.
         effective_parameters: How many parameters the images determine.
         blocks: How many blocks of pixels say something.
+        view_motion_mm: How far views were found to be off the geometry, root mean square at the nodes; None where they
+            were not, or it was not asked.
     """
 
     gc: list[float]
@@ -68,6 +70,7 @@ class Diagnostics:
     surprise: float = 0.0
     effective_parameters: float = 0.0
     blocks: int = 0
+    view_motion_mm: float | None = None
 
 
 def judge(found: Diagnostics) -> tuple[Status, list[str]]:

@@ -25,7 +25,7 @@ from torchkcreg.simulation.scanner import simulate_projections
 from torchkcreg.simulation.solids import Cylinder, Sphere, Tube
 
 PlateMotion = RodMotion | ElasticMotion
-ViewSet = Literal["neighbours", "around", "both", "spread"]
+ViewSet = Literal["neighbours", "around", "both", "spread", "many"]
 _SOFTENING_MM = 4.0  # over which a plate's curvature sets in beside a screw that holds it
 
 
@@ -37,7 +37,7 @@ def random_case(
     Args:
         seed: Names the case; or what was drawn, changed as you like.
         views: Three neighbouring views, a focal spot each; six around the limb; or both, in this order. "spread": three
-            around the limb.
+            around the limb; "many": 24 around it.
         elastic: The plate bends as its finite elements do under loads at its screws, which are known then; else as a
             rod with a drawn curvature.
         counts: The images, where they have been kept: making them takes seconds.
@@ -93,6 +93,7 @@ def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
     near = [draw.azimuth_deg + step for step in range(3)] if views in ("neighbours", "both") else []
     around = [draw.azimuth_deg + 30.0 * step + 10.0 for step in range(6)] if views in ("around", "both") else []
     around += [draw.azimuth_deg + 60.0 * step for step in range(3)] if views == "spread" else []
+    around += [draw.azimuth_deg + 15.0 * step for step in range(24)] if views == "many" else []
     angles = [*near, *around]
     names = [f"T{1 + index % 3}" for index in range(len(angles))]
     whole = [

@@ -1,0 +1,134 @@
+"""What the rows of a study say, in words, and the figures that show it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from torchkcreg.io import write_figure
+from torchkcreg.visualization.studies import (
+    coverage_figure,
+    errors_figure,
+    geometry_figure,
+    planned_figure,
+    verdict_figure,
+)
+
+from .simulated import MOMENTS, WIDTHS
+from .sweeps import Row
+
+WRONG_MM, RIGHT_MM = 0.15, 0.10
+_SETS = {"neighbours": "three views a degree apart", "around": "six views around the limb"}
+_WAYS = {"off": "as told", "auto": "views may move"}
+
+
+def of_population(rows: Sequence[Row], folder: Path) -> str:
+    """Errors and verdicts, how often error bars hold the truth and, where loads are known, how well they are found."""
+    whole = [row for row in rows if "error" not in row]
+    write_rows(folder / "population.csv", rows)
+    lines = [errors_in_words(rows)]
+    if whole and all(row["worst"] is not None for row in whole):
+        write_figure(folder / "errors.png", errors_figure(whole, right_mm=RIGHT_MM), dpi=110)
+        write_figure(folder / "verdict.png", verdict_figure(whole, wrong_mm=WRONG_MM, right_mm=RIGHT_MM), dpi=110)
+    if covered := [row for row in whole if row.get("coverage")]:
+        lines.append(of_coverage(covered, folder))
+    if loads := [row for row in whole if "gap_true" in row]:
+        lines += [loads_in_words(loads, place) for place in ("gap", "largest")]
+    return "\n".join(lines)
+
+
+def errors_in_words(rows: Sequence[Row]) -> str:
+    """The figures that matter, in one line; a registration that raised an error counts as far off, and said so."""
+    worst = np.array([row.get("worst", np.inf) for row in rows])
+    nodes = np.array([row.get("nodes", np.inf) for row in rows])
+    said = np.array(["error" in row or row["status"] != "ok" or bool(row["warnings"]) for row in rows])
+    seeds = np.array([row.get("seed", -1) for row in rows])
+    silent, idle = seeds[~said & (worst > WRONG_MM)].tolist(), seeds[said & (worst < RIGHT_MM)].tolist()
+    seconds = np.median([row.get("seconds", np.nan) for row in rows])
+    return (
+        f"{len(rows)} cases: node RMSE median {np.median(nodes):.3f}, worst figure median {np.median(worst):.3f}, "
+        f"90th percentile {np.percentile(worst, 90):.3f} mm; {int((worst < RIGHT_MM).sum())} below {RIGHT_MM} mm; "
+        f"silent failures {len(silent)} {silent}; idle alarms {len(idle)} {idle}; {seconds:.0f} s"
+    )
+
+
+def of_coverage(rows: Sequence[Row], folder: Path) -> str:
+    """Shares of true positions within 68 % and 95 % intervals, averaged over cases, of each set of views."""
+    sets = {}
+    for views in dict.fromkeys(row.get("views", "neighbours") for row in rows):
+        own = [row["coverage"] for row in rows if row.get("views", "neighbours") == views]
+        sets[views] = (len(own), {name: np.mean([one[name] for one in own], axis=0) for name in own[0]})
+    curves = {f"{_SETS.get(views, views)} ({n} cases)": parts for views, (n, parts) in sets.items()}
+    write_figure(folder / "coverage.png", coverage_figure(WIDTHS, curves), dpi=110)
+    header = ["true positions within 68 %, 95 % intervals", *next(iter(sets.values()))[1]]
+    table = [header, ["---"] * len(header)]
+    for title, parts in curves.items():
+        told = (f"{c[WIDTHS.index(1.0)]:.0%}, {c[WIDTHS.index(1.96)]:.0%}" for c in parts.values())
+        table.append([title, *told])
+    return "\n".join(f"| {' | '.join(row)} |" for row in table)
+
+
+def loads_in_words(rows: Sequence[Row], place: str) -> str:
+    """How well bending moments are found at a place, and how often their intervals hold them."""
+    true, found, std = (np.array([row[f"{place}_{name}"] for row in rows], dtype=float) for name in MOMENTS)
+    error = np.abs(found - true)
+    within = error <= np.maximum(0.05 * np.abs(true), 50.0)
+    return (
+        f"bending moments, {place}, of {len(rows)}: error median {np.median(error):.0f} N mm, "
+        f"{np.median(error / np.abs(true)):.1%} of them; "
+        f"{within.sum()} within 5 % or 50 N mm; {np.mean(error <= std):.0%} within one standard deviation, "
+        f"{np.mean(error <= 2 * std):.0%} within two"
+    )
+
+
+def of_geometry(rows: Sequence[Row], folder: Path) -> str:
+    """What errors of the geometry cost, and what is won back where views may move."""
+    write_rows(folder / "geometry.csv", rows)
+    rows = [row for row in rows if "error" not in row]
+    names = list(dict.fromkeys(row["geometry"] for row in rows))
+    errors = {
+        name: {way: [r["nodes"] for r in rows if (r["geometry"], r["view_motion"]) == (name, way)] for way in _WAYS}
+        for name in names
+    }
+    write_figure(folder / "geometry.png", geometry_figure(errors, _WAYS), dpi=110)
+    table = [["geometry off", "cases", *(f"{words}: nodes, shape (median, mm)" for words in _WAYS.values()), "moved"]]
+    table.append(["---"] * len(table[0]))
+    for name in names:
+        own = {way: [r for r in rows if (r["geometry"], r["view_motion"]) == (name, way)] for way in _WAYS}
+        cells = [
+            f"{np.median([r['nodes'] for r in some]):.3f}, {np.median([r['shape'] for r in some]):.3f}"
+            for some in own.values()
+        ]
+        moved = sum(bool(r["views_moved"]) for r in own["auto"])
+        table.append([name, str(len(own["off"])), *cells, f"{moved} of {len(own['auto'])}"])
+    return "\n".join(f"| {' | '.join(row)} |" for row in table)
+
+
+def of_views(rows: Sequence[Row], folder: Path) -> str:
+    """How often planned sets of views beat random ones."""
+    write_rows(folder / "views.csv", rows)
+    rows = [row for row in rows if "error" not in row]
+    planned = {row["seed"]: row["nodes"] for row in rows if row["planned"]}
+    random = [row for row in rows if not row["planned"] and row["seed"] in planned]
+    won = sum(planned[row["seed"]] < row["nodes"] for row in random)
+    expected, found = ([row[name] for row in rows] for name in ("expected_mm", "nodes"))
+    write_figure(folder / "views.png", planned_figure(expected, found, [row["planned"] for row in rows]), dpi=110)
+    correlation = float(np.corrcoef(np.log(expected), np.log(found))[0, 1])
+    best, others = (np.median([row["nodes"] for row in rows if row["planned"] == chosen]) for chosen in (True, False))
+    return (
+        f"planned sets of three beat random ones in {won} of {len(random)} draws, {len(planned)} cases: nodes "
+        f"{best:.3f} against {others:.3f} mm (median); "
+        f"correlation of log expected and log found error {correlation:.2f}"
+    )
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Nothing; writes rows as CSV, a column a key."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,161 @@
+"""One simulated case of the population, registered: errors in mm, and what the registration says of itself."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchkcreg.deformation import Deformation, FiniteElementDeformation
+from torchkcreg.evaluation import bb_rmse
+from torchkcreg.experiments.capture import registration_inputs
+from torchkcreg.geometry import fit_rigid, transform_points
+from torchkcreg.implant import find_holes
+from torchkcreg.mechanics import CarriedLoad
+from torchkcreg.physics import line_integrals_from_intensity
+from torchkcreg.registration import RegisteredImplant, RegistrationConfig, RegistrationData, register
+from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case
+
+from .sweeps import Job, Row
+from .wrong_geometry import wrong_geometry
+
+WIDTHS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.96, 2.25, 2.5, 2.75, 3.0, 3.5, 4.0)
+MOMENTS = ("true", "found", "std")
+
+
+def simulated(job: Job) -> Row:
+    """The row of a simulated case.
+
+    Args:
+        job: `seed` of the case; `views` ("neighbours", "around", "both" or "spread"); `elastic`: it bends under known
+            loads; `known`: screws and spectrum are told; `geometry`: how it is off, see `wrong_geometry`; `images`:
+            "own", or those of another case, "mirrored", "turned"; `options` of the registration; `cache`: folder that
+            keeps images; `chosen`: some of the views.
+    """
+    draw = draw_case(job["seed"])
+    case = made_case(draw, job["views"], job["elastic"], job["cache"])
+    config = RegistrationConfig(material=case.implant_material, **job["options"])
+    data, cloud, screws = registration_inputs(case, config.pitch_mm)
+    if job["images"] != "own":
+        data = replace(data, **_unrelated(draw, data, job["images"]))
+    nodes = cloud.coarsened(8).points.double()
+    truth = case.deform(nodes)
+    data = replace(data, geometry=wrong_geometry(data.geometry, truth, job["geometry"], draw.seed))
+    if job.get("chosen") is not None:
+        data = data.select(job["chosen"])
+    start = time.perf_counter()
+    result = register(
+        cloud,
+        data,
+        config,
+        spectrum=case.spectrum if job["known"] else None,
+        components=screws if job["known"] else (),
+        holes=find_holes(case.implant),
+    )
+    return {
+        "seed": draw.seed,
+        **errors_of(result.implants[0], case, nodes, truth),
+        "gc": round(float(result.gc.mean()), 4),
+        **{name: value for name, value in result.diagnostics.items() if name != "gc"},
+        "gc_views": result.diagnostics["gc"],
+        "status": result.status,
+        "warnings": "; ".join(result.warnings),
+        "seconds": round(time.perf_counter() - start, 1),
+        "azimuth": draw.azimuth_deg,
+        "scatter": round(draw.detector.scatter_fraction + draw.detector.scatter_removed, 3),
+        "kind": f"{draw.material} {draw.screw_material} {draw.scanner} {draw.kvp} kV water {draw.water_radius:.0f}",
+        "physics": " ".join(f"{name}={value:.3f}" for name, value in result.intensity.items()),
+        **load_errors(case, result.implants[0].deformation),
+    }
+
+
+def made_case(draw: Draw, views: Any, elastic: bool, cache: str) -> SimulatedCase:
+    """The case, its images out of a folder that keeps them, if there is one."""
+    kept = Path(cache) / f"{'elastic-' if elastic else ''}{views}-{draw.seed}.npy" if cache else None
+    counts = torch.from_numpy(np.load(kept)) if kept is not None and kept.exists() else None
+    case = random_case(draw, views=views, elastic=elastic, counts=counts)
+    if kept is not None and counts is None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        np.save(kept, case.intensity.numpy())
+    return case
+
+
+def _unrelated(draw: Draw, data: RegistrationData, images: str) -> dict[str, Any]:
+    """Line integrals and geometry of images that do not show the case's implant where the geometry has it."""
+    if images == "mirrored":
+        return {"line_integrals": data.line_integrals.flip(-1), "mask": data.mask.flip(-1)}
+    if images == "turned":
+        return {"line_integrals": data.line_integrals.flip(-2, -1), "mask": data.mask.flip(-2, -1)}
+    other = random_case(draw_case(draw.seed + 1000))
+    lines, mask = line_integrals_from_intensity(other.intensity.float(), other.open_beam)
+    return {"line_integrals": lines, "mask": mask, "geometry": other.geometry}
+
+
+def errors_of(implant: RegisteredImplant, case: SimulatedCase, nodes: Tensor, truth: Tensor) -> Row:
+    """Errors in mm: root mean squares of nodes and beads, of the nodes' shape, along the rays; the largest figure."""
+    found = implant.warp(nodes)
+    errors, still = found - truth, torch.zeros_like(nodes)
+    ray = case.geometry.source_positions.double().mean(0) - nodes.mean(0)
+    beads = float(bb_rmse(implant.warp(case.beads_before.double()), case.beads_after.double()))
+    node, largest = float(bb_rmse(errors, still)), float(errors.norm(dim=-1).max()) / 3
+    figures = {
+        "beads": beads,
+        "nodes": node,
+        "shape": float(bb_rmse(transform_points(fit_rigid(found, truth), found), truth)),
+        "largest_third": largest,
+        "worst": max(beads, node, largest),
+        "depth": float((errors @ (ray / ray.norm())).square().mean().sqrt()),
+    }
+    return {name: round(value, 4) for name, value in figures.items()} | {
+        "coverage": coverage_of(implant, case, nodes, errors)
+    }
+
+
+def coverage_of(implant: RegisteredImplant, case: SimulatedCase, nodes: Tensor, errors: Tensor) -> dict[str, list]:
+    """Which share of true positions lies within so many stated deviations, for each of `WIDTHS`."""
+    known = implant.deviations
+    if known is None:
+        return {}
+    beads = case.beads_before.double()
+    off = {"nodes": (nodes, errors), "beads": (beads, implant.warp(beads) - case.beads_after.double())}
+    _, axes = torch.linalg.eigh(torch.outer(known.depth, known.depth))
+    parts = {"lateral": (axes[:, 0], axes[:, 1]), "depth": (known.depth,)}
+    found = {}
+    for name, (points, error) in off.items():
+        spread = known.covariance(points)
+        for part, directions in parts.items():
+            sizes = [(error @ d).abs() / torch.einsum("i,nij,j->n", d, spread, d).sqrt() for d in directions]
+            size = torch.cat(sizes)
+            found[f"{name} {part}"] = [round(float((size <= width).double().mean()), 4) for width in WIDTHS]
+    return found
+
+
+def load_errors(case: SimulatedCase, deformation: Deformation) -> Row:
+    """Bending moments in N mm: the true one, what was found, its deviation.
+
+    In the middle between the fragments and where it is largest, each in the direction in which the plate is bent more.
+    """
+    carried = case.carried
+    if carried is None or not isinstance(deformation, FiniteElementDeformation):
+        return {}
+    found = CarriedLoad.of(
+        deformation.superelement, deformation.amounts.detach(), deformation.covariance, deformation.expected
+    )
+    signs = (found.axes @ carried.axes.mT).diagonal().sign()[:2]  # a lattice's axes may point the other way
+    true, moments, std = carried.section_loads[:, 3:5], signs * found.section_loads[:, 3:5], found.section_std[:, 3:5]
+    size = carried.hold_loads.abs().amax(0)
+    used = carried.hold_heights[(carried.hold_loads.abs() > 1e-3 * size).any(1)]
+    middle = carried.heights[-1] / 2
+    gap = (used[used < middle].max() + used[used > middle].min()) / 2
+    places = {"gap": int((carried.heights - gap).abs().argmin()), "largest": int(true.abs().amax(1).argmax())}
+    rows: Row = {}
+    for name, at in places.items():
+        axis = int(true[at].abs().argmax())
+        values = (float(x[at, axis]) for x in (true, moments, std))
+        rows |= {f"{name}_{key}": round(value) for key, value in zip(MOMENTS, values, strict=True)}
+    return rows

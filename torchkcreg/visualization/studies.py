@@ -1,0 +1,111 @@
+"""Studies of many registrations as figures: errors, verdicts, coverage, wrong geometries, planned views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+_BLUE, _SKY, _RED, _AMBER, _GREEN = "#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#009E73"
+_STATUS = {"ok": (_BLUE, _BLUE), "doubtful": (_AMBER, "none"), "failed": (_RED, "none")}
+_AGAINST = {"azimuth": "gantry angle (degrees; 90: face on)", "scatter": "scatter", "gc": "gradient correlation"}
+_MM_TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+def errors_figure(rows: Sequence[Mapping[str, Any]], *, right_mm: float) -> Figure:
+    """Errors against azimuth, scatter and gradient correlation; what the verdict doubts is hollow."""
+    figure = Figure(figsize=(12, 3.6), layout="constrained", facecolor="white")
+    axes = figure.subplots(1, 3, sharey=True)
+    for axis, (name, label) in zip(axes, _AGAINST.items(), strict=True):
+        for status, (edge, face) in _STATUS.items():
+            shown = [row for row in rows if row["status"] == status]
+            x, y = [row[name] for row in shown], [row["worst"] for row in shown]
+            axis.scatter(x, y, s=28, facecolors=face, edgecolors=edge, label=status)
+        axis.axhline(right_mm, color="0.8", zorder=0)
+        axis.set(xlabel=label, yscale="log")
+    axes[0].set_ylabel("largest of bead RMSE,\nnode RMSE, node maximum / 3 (mm)")
+    axes[2].legend(frameon=False)
+    return figure
+
+
+def verdict_figure(rows: Sequence[Mapping[str, Any]], *, wrong_mm: float, right_mm: float) -> Figure:
+    """Missed failures against idle alarms for every threshold of the expected error of the nodes, taken alone."""
+    expected = np.array([row["node_std_mm"] for row in rows])
+    worst = np.array([row["worst"] for row in rows])
+    wrong, right = worst > wrong_mm, worst < right_mm
+    thresholds = np.linspace(0.01, 0.2, 191)
+    figure = Figure(figsize=(9, 3.6), layout="constrained", facecolor="white")
+    left, curve = figure.subplots(1, 2)
+    left.scatter(expected, worst, s=24, color=_BLUE)
+    left.axhline(wrong_mm, color="0.8", zorder=0)
+    left.set(xlabel="node_std_mm", ylabel="largest error figure (mm)", xscale="log", yscale="log")
+    _ticks(left.xaxis, expected)
+    missed = [float((wrong & (expected <= t)).sum()) for t in thresholds]
+    idle = [float((right & (expected > t)).sum()) for t in thresholds]
+    curve.step(thresholds, missed, where="post", color=_RED, label=f"missed, of {wrong.sum()} above {wrong_mm} mm")
+    curve.step(thresholds, idle, where="post", color=_BLUE, label=f"idle, of {right.sum()} below {right_mm} mm")
+    curve.set(xlabel="threshold of node_std_mm (mm)", ylabel="registrations")
+    curve.legend(frameon=False)
+    return figure
+
+
+def coverage_figure(widths: Sequence[float], curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
+    """Share of true positions within intervals over their half width in stated deviations, a panel a set of cases."""
+    figure = Figure(figsize=(4.4 * len(curves), 3.8), layout="constrained", facecolor="white")
+    axes = np.atleast_1d(figure.subplots(1, len(curves), sharey=True))
+    normal = [math.erf(width / math.sqrt(2)) for width in widths]
+    for axis, (title, parts) in zip(axes, curves.items(), strict=True):
+        axis.plot(widths, normal, color="0.6", linestyle="--", label="normal distribution")
+        for (name, curve), colour in zip(parts.items(), (_BLUE, _SKY, _RED, _AMBER), strict=True):
+            axis.plot(widths, curve, color=colour, label=name)
+        axis.set(xlabel="half width (stated standard deviations)", title=title)
+    axes[0].set_ylabel("share of true positions in it")
+    axes[-1].legend(frameon=False)
+    return figure
+
+
+def geometry_figure(errors: Mapping[str, Mapping[str, Sequence[float]]], labels: Mapping[str, str]) -> Figure:
+    """Errors of all cases beside each other for each error of the geometry, without corrections and with them.
+
+    Args:
+        errors: Of each error of the geometry by its name: for each way to register, errors in mm.
+        labels: Of the ways, in words.
+    """
+    figure = Figure(figsize=(8.5, 3.8), layout="constrained", facecolor="white")
+    axis = figure.subplots()
+    for place, ways in enumerate(errors.values()):
+        for number, (way, colour) in enumerate(zip(labels, (_RED, _BLUE), strict=False)):
+            x = place + 0.3 * (number - 0.5)
+            values = np.array(ways[way])
+            spread = np.linspace(-0.09, 0.09, len(values)) if len(values) > 1 else np.zeros(1)
+            axis.scatter(x + spread, values, s=16, color=colour, alpha=0.55, label=labels[way] if not place else None)
+            axis.hlines(np.median(values), x - 0.12, x + 0.12, color=colour, linewidth=2.5)
+    axis.set(xticks=range(len(errors)), xticklabels=list(errors), yscale="log")
+    axis.set(xlabel="what the geometry has wrong", ylabel="error of the nodes (mm, RMS)")
+    _ticks(axis.yaxis, np.concatenate([np.array(v) for ways in errors.values() for v in ways.values()]))
+    axis.legend(frameon=False)
+    return figure
+
+
+def planned_figure(expected: Sequence[float], found: Sequence[float], planned: Sequence[bool]) -> Figure:
+    """Errors of sets of views against what was expected of them before any image; planned sets are filled."""
+    figure = Figure(figsize=(5.0, 4.2), layout="constrained", facecolor="white")
+    axis, chosen = figure.subplots(), np.array(planned, dtype=bool)
+    x, y = np.array(expected), np.array(found)
+    axis.scatter(x[~chosen], y[~chosen], s=24, facecolors="none", edgecolors="0.5", label="random views")
+    axis.scatter(x[chosen], y[chosen], s=36, color=_GREEN, label="planned views")
+    axis.set(xlabel="expected error (mm)", ylabel="error of the nodes (mm, RMS)", xscale="log", yscale="log")
+    _ticks(axis.xaxis, x)
+    _ticks(axis.yaxis, y)
+    axis.legend(frameon=False)
+    return figure
+
+
+def _ticks(axis: Any, values: np.ndarray) -> None:
+    """Ticks in plain millimetres where a logarithmic axis would write powers."""
+    inside = [t for t in _MM_TICKS if 0.7 * values.min() <= t <= 1.4 * values.max()]
+    axis.set_ticks(inside, [f"{t:g}" for t in inside])
+    axis.set_minor_formatter("")
