@@ -140,7 +140,7 @@ def test_files_give_it_back(element, bar) -> None:
 
 
 def test_a_stronger_prior_expects_more_and_one_hold_is_not_enough(bar, element) -> None:
-    twice = Superelement.of(bar, STEEL, HOLDS, prior=LoadPrior(600.0, 4000.0))
+    twice = Superelement.of(bar, STEEL, HOLDS, prior=LoadPrior(2 * LoadPrior().force, 2 * LoadPrior().moment))
     torch.testing.assert_close(twice.expected[:5], 2 * element.expected[:5], rtol=1e-6, atol=0)
     with pytest.raises(ValueError, match="held in two places or more, got 1"):
         Superelement.of(bar, STEEL, HOLDS[:1])

@@ -106,10 +106,11 @@ def load_files(
     stress, std = node_stresses(element, rested, amounts, known)
     worst, limit = int(stress.argmax()), element.constants.yield_stress
     if float(stress[worst]) > limit:
+        unloaded = against is not None or own.rest is not None
+        hint = "" if unloaded else "; a run without load takes that out: load --against it, or register --rest"
         warnings.append(
             f"stress reaches {float(stress[worst]):.0f} MPa, more than the {limit:.0f} MPa where the alloy yields: the "
-            "implant was bent before or beyond this load; a run without load takes that out: load --against it, or "
-            "register --rest"
+            f"implant {'stays bent' if unloaded else 'was bent before, or stays so,'} beyond this load{hint}"
         )
     found = ImplantLoad(
         CarriedLoad.of(element, amounts, covariance, own.expected),

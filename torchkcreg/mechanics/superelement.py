@@ -32,8 +32,8 @@ class LoadPrior:
         moment: About each axis, N mm.
     """
 
-    force: float = 300.0
-    moment: float = 2000.0
+    force: float = 200.0
+    moment: float = 1500.0
 
 
 @dataclass(frozen=True, eq=False)
