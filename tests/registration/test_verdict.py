@@ -47,6 +47,15 @@ def test_a_view_that_hardly_shows_the_implant_is_named() -> None:
     assert "view 1" in reason
 
 
+def test_what_would_help_is_what_the_error_comes_from() -> None:
+    _, (views,) = judge(replace(GOOD, node_std_mm=0.2))
+    _, (screws,) = judge(replace(GOOD, node_std_mm=0.2, screws_found=4))
+    _, (geometry,) = judge(replace(GOOD, node_std_mm=0.2, view_motion_mm=0.25))
+    assert "views from other sides would help" in views and "their list" not in views
+    assert "4 screws that were found, not given: their list" in screws
+    assert "the views are off the geometry by 0.25 mm" in geometry and "other sides" not in geometry
+
+
 def registered(data: RegistrationData, config: RegistrationConfig = CONFIG, **start):
     return Trainer(scene(config, **start), data, config).fit()
 

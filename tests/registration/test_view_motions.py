@@ -11,6 +11,7 @@ from small_scene import RIGID, image, plate, scene
 from torchkcreg.io import RunFolder, read_run
 from torchkcreg.registration import RegistrationConfig, RegistrationResult, Stage, register
 from torchkcreg.scene import RegistrationData, ViewMotions, ViewMotionSteps
+from torchkcreg.similarity import GradientDifference
 
 ALIGNED = Stage(oversampling=1, tolerance=1e-4, estimate=("views",), before=("align",))
 CONFIG = RegistrationConfig(stages=(*RIGID, ALIGNED))
@@ -92,6 +93,25 @@ def test_a_scene_goes_back_to_what_it_kept(data) -> None:
     here.restore(after)
     torch.testing.assert_close(here.view_motions.values, MOVED.double())
     assert here.float().view_motions.values.dtype == torch.float64
+
+
+def test_one_view_alone_is_at_odds_with_none(data) -> None:
+    config = CONFIG.model_copy(update={"view_motion": "on"})
+    assert register(plate(), data.select([1]), config).view_motions is None
+
+
+def test_a_similarity_of_ones_own_need_be_no_sum_of_squares(data) -> None:
+    class Similarity:
+        def __init__(self, fixed, mask, weights=None) -> None:
+            self.whole = GradientDifference(fixed, mask)
+
+        def __call__(self, images):
+            return self.whole(images)
+
+    stage = ALIGNED.model_copy(update={"optimizer": "adam", "iterations": 2})
+    config = CONFIG.model_copy(update={"stages": (stage,)})
+    result = register(plate(), moved(data)[0], config, similarity=Similarity)
+    assert result.view_motions is not None
 
 
 def test_motions_of_other_views_are_refused(data) -> None:

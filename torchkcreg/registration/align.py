@@ -53,7 +53,8 @@ def view_evidence(objective: Objective) -> ViewEvidence:
     images, whole = (m[others][:, others] for m in (known.images, known.images + known.penalties))
     _, less, fewer = _best(whole, images, slope[others])
     motion = step[views].unflatten(0, (-1, 6)).square().sum(-1).mean().sqrt()
-    return ViewEvidence(float(motion), float((gain - less) / (known.loss_of_a_deviation * (number - fewer))))
+    told = (number - fewer).clamp_min(1.0)
+    return ViewEvidence(float(motion), float((gain - less) / (known.loss_of_a_deviation * told)))
 
 
 def _slope(objective: Objective, at: Tensor) -> Tensor:

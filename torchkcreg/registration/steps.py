@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from torchkcreg.scene import Assembly, ViewMotions
+from torchkcreg.similarity import GradientDifference
 
 from .align import view_evidence
 from .basins import places
@@ -19,6 +20,7 @@ from .stage_run import StageRun, Step, changed
 from .verdict import Rival
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
+_FEWEST_VIEWS = 2  # one alone is at odds with none
 _ALIGN_BIN = 2  # views that moved need no finer pixels
 _LOOKS = ("find_screws", "choose_screws")
 
@@ -75,11 +77,13 @@ def weigh(run: StageRun) -> None:
 def align(run: StageRun) -> None:
     """Lets views move from now on, if they may and the images ask for it: that explains more than chance would."""
     config, scene = run.config, run.scene
-    if config.view_motion == "off" or scene.view_motions is not None:
+    if config.view_motion == "off" or scene.view_motions is not None or run.data.num_views < _FEWEST_VIEWS:
         return
     nodes = torch.cat([assembly.nodes() for assembly in scene])
     scene.view_motions = ViewMotions(nodes, run.data.num_views, config.view_motion_mm)
     probe = changed(run, bin=max(run.stage.bin, _ALIGN_BIN))
+    if run.terms.similarity is not None:  # which need not be a sum of squares
+        probe = replace(probe, terms=replace(run.terms, similarity=GradientDifference))
     probe.with_background()
     probe.objective = probe.objective.reweighted()
     found = view_evidence(probe.objective)

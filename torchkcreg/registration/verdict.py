@@ -106,14 +106,16 @@ def _doubts(found: Diagnostics) -> list[str]:
         reasons.append(f"the images agree weakly: gradient correlation is {min(found.gc):.2f}, less than {_WEAK:g}")
     if found.misfit > _UNEXPLAINED:
         reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained")
-    limit, told, help_by = _DEVIATION_MM, "", "views"
+    limit, told, hint = _DEVIATION_MM, "", "views from other sides would help"
     if found.screws_found:
-        limit, help_by = _DEVIATION_FOUND_MM, "their list, or views"
+        limit, hint = _DEVIATION_FOUND_MM, "their list, or views from other sides would help"
         told = f" with {found.screws_found} screws that were found, not given"
+    if found.view_motion_mm is not None:
+        hint = f"the views are off the geometry by {found.view_motion_mm:.2f} mm, one that holds would help"
     if not found.node_std_mm <= limit:
         reasons.append(
             f"the implant's nodes are expected to be off by {found.node_std_mm:.3f} mm (RMS), more than "
-            f"{limit:g} mm{told}: {help_by} from other sides would help"
+            f"{limit:g} mm{told}: {hint}"
         )
     hardly = [str(view) for view, share in enumerate(found.seen) if share < _HARDLY_SEEN]
     if hardly and max(found.seen) >= _SEEN:

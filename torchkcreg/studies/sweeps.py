@@ -105,7 +105,7 @@ def _made(
         return
     if cluster is None:
         joblib = _installed("joblib", "several workers")
-        calls = [joblib.delayed(_one)(function, job) for job in jobs]
+        calls = [joblib.delayed(_on_one_thread)(function, job) for job in jobs]
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
             yield from joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(calls)
         return
@@ -115,7 +115,7 @@ def _made(
     except (OSError, ValueError) as error:  # a timeout is an OSError
         raise ValueError(f"no Dask scheduler answers at {cluster}: {error}") from None
     with client:
-        futures = client.map(_one, [function] * len(jobs), jobs, pure=False)
+        futures = client.map(_on_one_thread, [function] * len(jobs), jobs, pure=False)
         for future in distributed.as_completed(futures):
             yield future.result()
 
@@ -127,8 +127,12 @@ def _installed(package: str, asked: str) -> Any:
         raise ValueError(f"{asked} needs {package}: pip install 'torchkcreg[studies]'") from None
 
 
-def _one(function: Callable[[Job], Row], job: Job) -> tuple[Job, Row]:
+def _on_one_thread(function: Callable[[Job], Row], job: Job) -> tuple[Job, Row]:
     torch.set_num_threads(1)
+    return _one(function, job)
+
+
+def _one(function: Callable[[Job], Row], job: Job) -> tuple[Job, Row]:
     try:
         return job, function(job)
     except (ValueError, RuntimeError) as error:
