@@ -89,15 +89,18 @@ def of_geometry(rows: Sequence[Row], folder: Path) -> str:
     write_rows(folder / "geometry.csv", rows)
     rows = [row for row in rows if "error" not in row]
     names = list(dict.fromkeys(row["geometry"] for row in rows))
-    errors = {
-        name: {way: [r["nodes"] for r in rows if (r["geometry"], r["view_motion"]) == (name, way)] for way in _WAYS}
+    of = {
+        name: {way: [r for r in rows if (r["geometry"], r["view_motion"]) == (name, way)] for way in _WAYS}
         for name in names
+    }
+    errors = {
+        title: {name: {way: [r[key] for r in own] for way, own in ways.items()} for name, ways in of.items()}
+        for key, title in (("nodes", "where the nodes are"), ("shape", "how the implant is bent"))
     }
     write_figure(folder / "geometry.png", geometry_figure(errors, _WAYS), dpi=110)
     table = [["geometry off", "cases", *(f"{words}: nodes, shape (median, mm)" for words in _WAYS.values()), "moved"]]
     table.append(["---"] * len(table[0]))
-    for name in names:
-        own = {way: [r for r in rows if (r["geometry"], r["view_motion"]) == (name, way)] for way in _WAYS}
+    for name, own in of.items():
         cells = [
             f"{np.median([r['nodes'] for r in some]):.3f}, {np.median([r['shape'] for r in some]):.3f}"
             for some in own.values()

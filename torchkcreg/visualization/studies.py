@@ -67,26 +67,31 @@ def coverage_figure(widths: Sequence[float], curves: Mapping[str, Mapping[str, S
     return figure
 
 
-def geometry_figure(errors: Mapping[str, Mapping[str, Sequence[float]]], labels: Mapping[str, str]) -> Figure:
+def geometry_figure(
+    errors: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], labels: Mapping[str, str]
+) -> Figure:
     """Errors of all cases beside each other for each error of the geometry, without corrections and with them.
 
     Args:
-        errors: Of each error of the geometry by its name: for each way to register, errors in mm.
+        errors: A panel each, by its title: of each error of the geometry by its name, for each way to register, mm.
         labels: Of the ways, in words.
     """
-    figure = Figure(figsize=(8.5, 3.8), layout="constrained", facecolor="white")
-    axis = figure.subplots()
-    for place, ways in enumerate(errors.values()):
-        for number, (way, colour) in enumerate(zip(labels, (_RED, _BLUE), strict=False)):
-            x = place + 0.3 * (number - 0.5)
-            values = np.array(ways[way])
-            spread = np.linspace(-0.09, 0.09, len(values)) if len(values) > 1 else np.zeros(1)
-            axis.scatter(x + spread, values, s=16, color=colour, alpha=0.55, label=labels[way] if not place else None)
-            axis.hlines(np.median(values), x - 0.12, x + 0.12, color=colour, linewidth=2.5)
-    axis.set(xticks=range(len(errors)), xticklabels=list(errors), yscale="log")
-    axis.set(xlabel="what the geometry has wrong", ylabel="error of the nodes (mm, RMS)")
-    _ticks(axis.yaxis, np.concatenate([np.array(v) for ways in errors.values() for v in ways.values()]))
-    axis.legend(frameon=False)
+    figure = Figure(figsize=(11.0, 3.8), layout="constrained", facecolor="white")
+    axes = figure.subplots(1, len(errors), sharey=True)
+    for axis, (title, names) in zip(axes, errors.items(), strict=True):
+        for place, ways in enumerate(names.values()):
+            for number, (way, colour) in enumerate(zip(labels, (_RED, _BLUE), strict=False)):
+                x, values = place + 0.3 * (number - 0.5), np.array(ways[way])
+                spread = np.linspace(-0.09, 0.09, len(values)) if len(values) > 1 else np.zeros(1)
+                words = labels[way] if not place else None
+                axis.scatter(x + spread, values, s=16, color=colour, alpha=0.55, label=words)
+                axis.hlines(np.median(values), x - 0.12, x + 0.12, color=colour, linewidth=2.5)
+        axis.set(xticks=range(len(names)), xticklabels=list(names), yscale="log", title=title)
+        axis.set_xlabel("what the geometry has wrong")
+    axes[0].set_ylabel("error (mm, RMS)")
+    every = [v for names in errors.values() for ways in names.values() for values in ways.values() for v in values]
+    _ticks(axes[0].yaxis, np.array(every))
+    axes[0].legend(frameon=False)
     return figure
 
 
