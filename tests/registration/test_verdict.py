@@ -21,7 +21,7 @@ BAD = {
     "misfit": ("doubtful", 0.1),
     "node_std_mm": ("doubtful", float("nan")),
     "strain": ("doubtful", 0.01),
-    "surprise": ("doubtful", 4.0),
+    "surprise": ("doubtful", 5.0),
     "converged": ("doubtful", False),
     "at_bounds": ("doubtful", ["scatter"]),
     "rival": ("doubtful", Rival(distance_mm=16.0, misfit=0.011, best_misfit=0.01)),
