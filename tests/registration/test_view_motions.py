@@ -33,6 +33,14 @@ def data() -> RegistrationData:
     return image(scene(CONFIG))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def coarse():
+    """Coarse pixels tell less of a motion than a scan's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torchkcreg.registration.align._LEAST_STRENGTH", 10.0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def found(data) -> tuple[RegistrationResult, RegistrationData, ViewMotions]:
     off, motions = moved(data)

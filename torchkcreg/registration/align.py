@@ -10,7 +10,7 @@ from torch import Tensor
 from .objective import Objective
 
 _WEIGHINGS = 2
-_LEAST_STRENGTH = 12.0  # in simulations up to 7 where the geometry was right, 70 and more where it was off by 0.3 mm
+_LEAST_STRENGTH = 25.0  # in simulations up to 16 where the geometry was right, 70 and more where it was off by 0.3 mm
 
 
 class ViewEvidence(NamedTuple):
