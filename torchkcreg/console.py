@@ -1,11 +1,11 @@
-"""How a command ends: with its exit status, warnings of a line each, and an error of one line."""
+"""What people read: how a command ends, with warnings of a line each and an error of one line, and tables."""
 
 from __future__ import annotations
 
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 WRONG, INTERRUPTED = 2, 130  # exit statuses
@@ -55,3 +55,14 @@ def _told(error: Exception) -> str:
     memory = isinstance(error, MemoryError) or "not enough memory" in str(error)
     what = "out of memory" if memory else f"{type(error).__name__}: {one_line(error)[:200]}"
     return f"{what}{step} (--debug shows the traceback)"
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table.
+
+    >>> print(markdown_table(["plate", "mm"], [["femoral", "0.03"]]))
+    | plate | mm |
+    | --- | --- |
+    | femoral | 0.03 |
+    """
+    return "\n".join(f"| {' | '.join(row)} |" for row in [header, ["---"] * len(header), *rows])

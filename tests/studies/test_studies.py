@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 import torch
@@ -126,6 +127,17 @@ def test_the_command_refuses_what_is_no_study_case_or_option(tmp_path, capsys):
     assert not (tmp_path / "x").exists()
 
 
+def test_the_command_knows_every_study_and_no_other(tmp_path, capsys):
+    for name in STUDIES:
+        assert main(["study", name, "--cases=0", f"--out={tmp_path}"]) == 2
+        assert "a study needs a case or more" in capsys.readouterr().err
+
+
+def test_images_without_a_right_answer_are_failures_that_must_be_told(tmp_path):
+    rows = [{**row_of(StudyOptions().job(0)), "worst": None, "status": status} for status in ("ok", "failed")]
+    assert "silent failures 1 [0]" in STUDIES["population"].report(rows, tmp_path)
+
+
 @pytest.mark.slow
 def test_a_case_of_the_population_is_registered(tmp_path):
     job = StudyOptions(cases=1, known=True, cache=str(tmp_path)).job(0)
@@ -134,3 +146,4 @@ def test_a_case_of_the_population_is_registered(tmp_path):
     assert len(list(tmp_path.glob("*.npy"))) == 1
     other = simulated({**job, "images": "mirrored"})
     assert other["status"] == "failed" or other["warnings"]
+    assert other["worst"] == math.inf

@@ -11,6 +11,7 @@ from statistics import fmean, median
 import torch
 from torch import Tensor
 
+from torchkcreg.console import markdown_table
 from torchkcreg.geometry import fit_rigid, rotation_about, transform_points
 from torchkcreg.implant import Component, ImplantPointCloud
 from torchkcreg.physics import line_integrals_from_intensity
@@ -83,7 +84,7 @@ class CaptureStudy:
         | 5 mm, 5 deg | 2 | 6.8 | 50 % | 50 % | 1.520 | 3.000 | 2.0 |
         """
         columns = ("start off by", "starts", "RMS (mm)", "captured", "right minimum", "median error (mm)")
-        rows = [[*columns, "largest (mm)", "median s"], ["---"] * 8]
+        rows = []
         for offset in self.offsets:
             trials = self.at(offset)
             shares = (f"{100 * share:.0f} %" for share in (self.captured_share(offset), self.basin_share(offset)))
@@ -99,7 +100,7 @@ class CaptureStudy:
                     f"{median(trial.seconds for trial in trials):.1f}",
                 ]
             )
-        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        return markdown_table([*columns, "largest (mm)", "median s"], rows)
 
 
 def capture_study(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchkcreg.console import markdown_table
 from torchkcreg.io import write_figure
 from torchkcreg.visualization.studies import (
     coverage_figure,
@@ -42,7 +43,7 @@ def of_population(rows: Sequence[Row], folder: Path) -> str:
 
 def errors_in_words(rows: Sequence[Row]) -> str:
     """The figures that matter, in one line; a registration that raised an error counts as far off, and said so."""
-    worst = np.array([row.get("worst", np.inf) for row in rows])
+    worst = np.array([np.inf if row.get("worst") is None else row["worst"] for row in rows])  # JSON has no infinity
     nodes = np.array([row.get("nodes", np.inf) for row in rows])
     said = np.array(["error" in row or row["status"] != "ok" or bool(row["warnings"]) for row in rows])
     seeds = np.array([row.get("seed", -1) for row in rows])
@@ -64,11 +65,11 @@ def of_coverage(rows: Sequence[Row], folder: Path) -> str:
     curves = {f"{_SETS.get(views, views)} ({n} cases)": parts for views, (n, parts) in sets.items()}
     write_figure(folder / "coverage.png", coverage_figure(WIDTHS, curves), dpi=110)
     header = ["true positions within 68 %, 95 % intervals", *next(iter(sets.values()))[1]]
-    table = [header, ["---"] * len(header)]
-    for title, parts in curves.items():
-        told = (f"{c[WIDTHS.index(1.0)]:.0%}, {c[WIDTHS.index(1.96)]:.0%}" for c in parts.values())
-        table.append([title, *told])
-    return "\n".join(f"| {' | '.join(row)} |" for row in table)
+    table = [
+        [title, *(f"{c[WIDTHS.index(1.0)]:.0%}, {c[WIDTHS.index(1.96)]:.0%}" for c in parts.values())]
+        for title, parts in curves.items()
+    ]
+    return markdown_table(header, table)
 
 
 def loads_in_words(rows: Sequence[Row], place: str) -> str:
@@ -98,8 +99,8 @@ def of_geometry(rows: Sequence[Row], folder: Path) -> str:
         for key, title in (("nodes", "where the nodes are"), ("shape", "how the implant is bent"))
     }
     write_figure(folder / "geometry.png", geometry_figure(errors, _WAYS), dpi=110)
-    table = [["geometry off", "cases", *(f"{words}: nodes, shape (median, mm)" for words in _WAYS.values()), "moved"]]
-    table.append(["---"] * len(table[0]))
+    header = ["geometry off", "cases", *(f"{words}: nodes, shape (median, mm)" for words in _WAYS.values()), "moved"]
+    table = []
     for name, own in of.items():
         cells = [
             f"{np.median([r['nodes'] for r in some]):.3f}, {np.median([r['shape'] for r in some]):.3f}"
@@ -107,7 +108,7 @@ def of_geometry(rows: Sequence[Row], folder: Path) -> str:
         ]
         moved = sum(bool(r["views_moved"]) for r in own["auto"])
         table.append([name, str(len(own["off"])), *cells, f"{moved} of {len(own['auto'])}"])
-    return "\n".join(f"| {' | '.join(row)} |" for row in table)
+    return markdown_table(header, table)
 
 
 def of_views(rows: Sequence[Row], folder: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -32,13 +33,20 @@ def simulated(job: Job) -> Row:
     """The row of a simulated case.
 
     Args:
-        job: `seed` of the case; `views` ("neighbours", "around", "both" or "spread"); `elastic`: it bends under known
-            loads; `known`: screws and spectrum are told; `geometry`: how it is off, see `wrong_geometry`; `images`:
-            "own", or those of another case, "mirrored", "turned"; `options` of the registration; `cache`: folder that
-            keeps images; `chosen`: some of the views.
+        job: `seed` of the case; `views` ("neighbours", "around", "both", "spread" or "many"); `elastic`: it bends under
+            known loads; `known`: screws and spectrum are told; `geometry`: how it is off, see `wrong_geometry`;
+            `images`: "own", or those of another case, "mirrored", "turned"; `options` of the registration; `cache`:
+            folder that keeps images.
     """
     draw = draw_case(job["seed"])
-    case = made_case(draw, job["views"], job["elastic"], job["cache"])
+    return registered(job, draw, made_case(draw, job["views"], job["elastic"], job["cache"]))
+
+
+def registered(job: Job, draw: Draw, case: SimulatedCase, *, chosen: list[int] | None = None) -> Row:
+    """The row of a case that is there, registered to all of its views or to those that are chosen.
+
+    Images that do not show the implant where the geometry has it have no right answer: the worst error is infinite.
+    """
     config = RegistrationConfig(material=case.implant_material, **job["options"])
     data, cloud, screws = registration_inputs(case, config.pitch_mm)
     if job["images"] != "own":
@@ -46,8 +54,8 @@ def simulated(job: Job) -> Row:
     nodes = cloud.coarsened(8).points.double()
     truth = case.deform(nodes)
     data = replace(data, geometry=wrong_geometry(data.geometry, truth, job["geometry"], draw.seed))
-    if job.get("chosen") is not None:
-        data = data.select(job["chosen"])
+    if chosen is not None:
+        data = data.select(chosen)
     start = time.perf_counter()
     result = register(
         cloud,
@@ -57,9 +65,11 @@ def simulated(job: Job) -> Row:
         components=screws if job["known"] else (),
         holes=find_holes(case.implant),
     )
+    no_answer = {} if job["images"] == "own" else {"worst": math.inf}
     return {
         "seed": draw.seed,
         **errors_of(result.implants[0], case, nodes, truth),
+        **no_answer,
         "gc": round(float(result.gc.mean()), 4),
         **{name: value for name, value in result.diagnostics.items() if name != "gc"},
         "gc_views": result.diagnostics["gc"],

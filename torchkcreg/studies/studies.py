@@ -14,7 +14,7 @@ from torchkcreg.registration import RegistrationConfig, build_scene, view_inform
 from torchkcreg.simulation import draw_case
 
 from .reports import of_coverage, of_geometry, of_population, of_views
-from .simulated import made_case, simulated
+from .simulated import made_case, registered, simulated
 from .sweeps import Job, Row, sweep
 from .wrong_geometry import ERRORS
 
@@ -29,10 +29,10 @@ class StudyOptions:
     Attributes:
         cases: How many cases of the population; None: as many as the study usually has.
         first: Seed of the first one.
-        views: "neighbours", "around", "both" or "spread"; the population alone.
-        known: Screws and spectrum are told; the population alone.
-        elastic: Plates bend under known loads; the population alone.
-        images: "own", or those of another case, "mirrored", "turned"; the population alone.
+        views: "neighbours", "around", "both" or "spread"; studies of coverage and views have their own.
+        known: Screws and spectrum are told; in studies of geometry and views they always are.
+        elastic: Plates bend under known loads.
+        images: "own", or those of another case, "mirrored", "turned".
         options: Of the registration.
         cache: Folder that keeps images.
     """
@@ -142,18 +142,19 @@ def _views(options: StudyOptions) -> list[Job]:
 
 def planned(job: Job) -> Row:
     """Registered to three views of many: the set that is planned, or, by its number, a random one."""
-    case = made_case(draw_case(job["seed"]), job["views"], job["elastic"], job["cache"])
+    draw = draw_case(job["seed"])
+    case = made_case(draw, job["views"], job["elastic"], job["cache"])
     config = RegistrationConfig(material=case.implant_material, **job["options"])
     _, cloud, screws = registration_inputs(case, config.pitch_mm)
     scene = build_scene(cloud, config, spectrum=case.spectrum, components=screws)
-    known = view_information(scene, case.geometry, config, range(case.geometry.num_views))
+    known = view_information(scene, case.geometry, config)
     if job["random"] is None:
         chosen = list(known.best(_VIEWS)[0].views)
     else:
         generator = torch.Generator().manual_seed(1000 * job["seed"] + job["random"])
         chosen = torch.randperm(case.geometry.num_views, generator=generator)[:_VIEWS].tolist()
     expected = float(known.expected(torch.tensor([chosen]))[0])
-    row = simulated({**job, "chosen": chosen})
+    row = registered(job, draw, case, chosen=chosen)
     return {**row, "chosen": chosen, "expected_mm": round(expected, 4), "planned": job["random"] is None}
 
 
