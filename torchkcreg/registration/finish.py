@@ -7,16 +7,14 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from torchkcreg.scene import RegistrationData, Scene
-from torchkcreg.similarity import GradientCorrelation, GradientDifference
+from torchkcreg.similarity import GradientCorrelation
 
 from .config import RegistrationConfig, Stage
 from .diagnosis import diagnose
 from .registered_implant import RegisteredImplant
 from .result import RegistrationResult
-from .stage_run import StageRun, Terms, changed, similarities
+from .stage_run import StageRun, Terms, coarse, similarities
 from .verdict import Rival, judge
-
-_COARSE_BIN = 2  # an expected error needs no finer pixels
 
 
 def finished(
@@ -36,9 +34,9 @@ def finished(
     run = StageRun(scene, data, last, config, terms=terms)
     run.with_background()
     gc = similarities(run, GradientCorrelation)  # in which every pixel counts alike
-    coarse = _diagnosed(run, data)
+    probe = _diagnosed(run, data)
     converged = _converged(history, last) and stopped is None
-    found, deviations = diagnose(coarse.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
+    found, deviations = diagnose(probe.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
     status, reasons = judge(found)
     if stopped is not None:
         reasons = [*reasons, f"the registration was ended before its time: {stopped}"]
@@ -63,14 +61,11 @@ def finished(
 
 
 def _diagnosed(run: StageRun, data: RegistrationData) -> StageRun:
-    """The last stage on pixels that are coarse enough to be quick, by a similarity that is a sum of squares."""
-    coarse = changed(replace(run, data=data), bin=max(run.stage.bin, _COARSE_BIN))
-    if run.terms.similarity is not None:
-        coarse = replace(coarse, terms=replace(run.terms, similarity=GradientDifference))
-    coarse.with_background()
+    """The last stage on pixels that are coarse enough to be quick, weighted as it was."""
+    probe = coarse(replace(run, data=data))
     if "reweight" in run.stage.before:
-        coarse.objective = coarse.objective.reweighted()
-    return coarse
+        probe.objective = probe.objective.reweighted()
+    return probe
 
 
 def _converged(history: Sequence[dict[str, Any]], last: Stage) -> bool:

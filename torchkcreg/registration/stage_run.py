@@ -35,6 +35,8 @@ class Terms:
 
 Step = Callable[["StageRun"], None]
 
+_COARSE_BIN = 2  # an expected error needs no finer pixels
+
 
 @dataclass
 class StageRun:
@@ -167,3 +169,12 @@ def changed(run: StageRun, **options: object) -> StageRun:
     """A run of the same scene and data with another stage's options."""
     stage = run.stage.model_copy(update=options)
     return replace(run, stage=stage, optimizer=None, reports=[], _objective=None)
+
+
+def coarse(run: StageRun) -> StageRun:
+    """A run of the same stage for expected errors: on coarse pixels, by a similarity that is a sum of squares."""
+    probe = changed(run, bin=max(run.stage.bin, _COARSE_BIN))
+    if run.terms.similarity is not None:
+        probe = replace(probe, terms=replace(run.terms, similarity=GradientDifference))
+    probe.with_background()
+    return probe

@@ -10,18 +10,16 @@ from typing import Any
 import torch
 
 from torchkcreg.scene import Assembly, ViewMotions
-from torchkcreg.similarity import GradientDifference
 
 from .align import view_evidence
 from .basins import places
 from .config import Stage
 from .screws import find_screws, of_best_metal, screws_by_metal
-from .stage_run import StageRun, Step, changed
+from .stage_run import StageRun, Step, coarse
 from .verdict import Rival
 
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
 _FEWEST_VIEWS = 2  # one alone is at odds with none
-_ALIGN_BIN = 2  # views that moved need no finer pixels
 _LOOKS = ("find_screws", "choose_screws")
 
 
@@ -81,10 +79,7 @@ def align(run: StageRun) -> None:
         return
     nodes = torch.cat([assembly.nodes() for assembly in scene])
     scene.view_motions = ViewMotions(nodes, run.data.num_views, config.view_motion_mm)
-    probe = changed(run, bin=max(run.stage.bin, _ALIGN_BIN))
-    if run.terms.similarity is not None:  # which need not be a sum of squares
-        probe = replace(probe, terms=replace(run.terms, similarity=GradientDifference))
-    probe.with_background()
+    probe = coarse(run)
     probe.objective = probe.objective.reweighted()
     found = view_evidence(probe.objective)
     if config.view_motion == "auto" and not found.is_strong:
