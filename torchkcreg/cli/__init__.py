@@ -1,4 +1,4 @@
-"""The command line: ``torchkcreg register | warp | evaluate | load | compare | plan | reconstruct | ...``."""
+"""The command line: ``torchkcreg register | warp | evaluate | load | compare | simulate | reconstruct | ...``."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from .compare import add_compare
 from .load import add_load
 from .plan import add_plan
 from .register import add_register
+from .simulate import add_simulate
 from .study import add_study
 
 # Before torch starts its threads. Between small operations they wait by spinning for a few microseconds: asleep at
@@ -55,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     add_load(commands)
     add_compare(commands)
     add_plan(commands)
+    add_simulate(commands)
     add_study(commands)
     _add_reconstruct(commands)
     _add_info(commands)

@@ -15,6 +15,7 @@ from torchkcreg.experiments.register_files import RegistrationFiles, register_fi
 from torchkcreg.experiments.registered_components import registered_components
 from torchkcreg.experiments.runs_compared import runs_compared
 from torchkcreg.experiments.seeds import SeedRuns, register_seeds
+from torchkcreg.experiments.simulate_files import SimulatedFiles, simulate_files
 
 __all__ = [
     "CaptureStudy",
@@ -26,6 +27,7 @@ __all__ = [
     "ReconstructionOptions",
     "RegistrationFiles",
     "SeedRuns",
+    "SimulatedFiles",
     "ViewPlan",
     "capture_study",
     "compare_files",
@@ -44,4 +46,5 @@ __all__ = [
     "resolve_config",
     "resolve_options",
     "runs_compared",
+    "simulate_files",
 ]

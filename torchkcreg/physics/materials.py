@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+_CALCIUM = re.compile(r"ca(\d+\.?\d*)")
 ALIASES = {
     "316l": "steel",
     "stainless_steel": "steel",
@@ -95,7 +97,7 @@ def material(name: str, *, density: float | None = None) -> Material:
 
     Among others `steel` (316L, 7.95 g/cm^3), `titanium` (Ti-6Al-4V, 4.43), `cocr` (ASTM F75, 8.3), `aluminium`,
     `copper`, `water`, `soft_tissue`, `cortical_bone` (ICRU 44, 1.92), `cancellous_bone`, `pmma`, `csi`; all of them in
-    `material_names()`.
+    `material_names()`. `ca50` is water with 50 mg/mL of calcium, and so is any other number.
 
     Raises:
         ValueError: If there is no such material; the message lists those there are.
@@ -105,9 +107,12 @@ def material(name: str, *, density: float | None = None) -> Material:
     """
     key = name.strip().lower().replace(" ", "_")
     key = ALIASES.get(key, key)
-    if key not in material_names():
-        raise ValueError(f"material must be one of {', '.join(material_names())}, got {name!r}")
-    found = _packaged_material(key)
+    if match := _CALCIUM.fullmatch(key):
+        found = calcium_in_water(float(match[1]))
+    elif key in material_names():
+        found = _packaged_material(key)
+    else:
+        raise ValueError(f"material must be one of {', '.join(material_names())}, ca50 and so on, got {name!r}")
     return found if density is None else found.with_density(density)
 
 

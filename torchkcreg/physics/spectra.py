@@ -14,6 +14,8 @@ from torchkcreg.physics.reduction import effective_energies
 
 DEFAULT_FILTRATION_MM = {"aluminium": 2.5, "copper": 0.2}
 NEGLIGIBLE_WEIGHT = 1e-7
+PACKAGED_ANODE_DEG = 12.0
+_LOWEST_KVP, _HIGHEST_KVP, _LOWEST_KEV = 30.0, 150.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -81,26 +83,31 @@ class Spectrum:
 
 
 def tungsten_spectrum(
-    kvp: int = 90, *, filtration_mm: Mapping[str, float] | None = None, csi_mm: float = 0.6
+    kvp: float = 90,
+    *,
+    filtration_mm: Mapping[str, float] | None = None,
+    csi_mm: float = 0.6,
+    anode_deg: float = PACKAGED_ANODE_DEG,
 ) -> Spectrum:
-    """Spectrum of a tungsten tube (12 degree anode) as a CsI detector absorbs it, weighted by energy.
+    """Spectrum of a tungsten tube as a CsI detector absorbs it, weighted by energy.
 
-    `w(E) = N(E) exp(-sum_f mu_f(E) t_f) (1 - exp(-mu_CsI(E) t)) E`, N from SpekPy 2 in bins of 1 keV.
+    `w(E) = N(E) exp(-sum_f mu_f(E) t_f) (1 - exp(-mu_CsI(E) t)) E`, N from SpekPy 2 in bins of 1 keV: packaged for 70,
+    80, 90, 100, 110 and 120 kV and an anode of 12 degrees, else computed where SpekPy is installed.
 
     Args:
-        kvp: Tube voltage: 70, 80, 90, 100, 110 or 120 kV.
+        kvp: Tube voltage, kV.
         filtration_mm: Filters, material to mm; 2.5 mm of aluminium and 0.2 mm of copper where None.
         csi_mm: Thickness of the scintillator, mm of solid CsI.
+        anode_deg: Angle of the anode.
 
     Raises:
-        ValueError: If the voltage is not one of those, or a filter's material is unknown.
+        ValueError: If the voltage is not packaged and SpekPy is not installed, or a filter's material is unknown.
 
     >>> 50 < tungsten_spectrum(90).mean_energy < 60
     True
     """
-    if kvp not in _anode_spectra():
-        raise ValueError(f"kvp must be one of {', '.join(map(str, _anode_spectra()))}, got {kvp}")
-    energies, photons = _anode_spectra()[kvp]
+    packaged = kvp in _anode_spectra() and anode_deg == PACKAGED_ANODE_DEG
+    energies, photons = _anode_spectra()[int(kvp)] if packaged else _computed(kvp, anode_deg)
     exponent = np.zeros_like(energies)
     for name, thickness in (DEFAULT_FILTRATION_MM if filtration_mm is None else filtration_mm).items():
         exponent -= material(name).attenuation(energies).numpy() * thickness
@@ -108,6 +115,24 @@ def tungsten_spectrum(
     weights = photons * np.exp(exponent) * absorbed * energies
     kept = weights > NEGLIGIBLE_WEIGHT * weights.sum()
     return Spectrum(tuple(energies[kept]), tuple(weights[kept]))
+
+
+def _computed(kvp: float, anode_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Energies in keV and photons per keV before any filter, by SpekPy."""
+    try:
+        import spekpy
+    except ImportError:
+        voltages = ", ".join(map(str, _anode_spectra()))
+        raise ValueError(
+            f"kvp must be one of {voltages} and the anode's angle {PACKAGED_ANODE_DEG:g} degrees without SpekPy "
+            f"(pip install 'torchkcreg[simulate]'), got {kvp:g} and {anode_deg:g}"
+        ) from None
+    if not (_LOWEST_KVP <= kvp <= _HIGHEST_KVP and 0 < anode_deg < 90):
+        span = f"{_LOWEST_KVP:g} to {_HIGHEST_KVP:g}"
+        raise ValueError(f"kvp must lie within {span} and the anode's angle within 0 to 90, got {kvp:g}, {anode_deg:g}")
+    energies, photons = spekpy.Spek(kvp=float(kvp), th=float(anode_deg), dk=1).get_spectrum()
+    kept = energies >= _LOWEST_KEV  # of the tables of attenuation
+    return np.asarray(energies)[kept], np.asarray(photons)[kept]
 
 
 @cache

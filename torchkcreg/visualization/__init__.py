@@ -4,6 +4,7 @@ Each function returns a matplotlib `Figure` of its own; nothing touches pyplot's
 """
 
 from .capture import capture_figure
+from .case import case_figure
 from .comparison import comparison_figure
 from .displacement import displacement_figure
 from .errors import error_map_figure, histogram_figure
@@ -15,6 +16,7 @@ from .reconstruction import reconstruction_figure
 
 __all__ = [
     "capture_figure",
+    "case_figure",
     "comparison_figure",
     "displacement_figure",
     "error_map_figure",
