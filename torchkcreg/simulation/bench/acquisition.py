@@ -1,0 +1,137 @@
+"""Images of a specimen under each of its loads, as a scanner takes them, with the truth about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
+from torchkcreg.physics import Beam, Spectrum, material
+from torchkcreg.simulation.bench.loaded import ElasticConstruct, Loaded, loaded
+from torchkcreg.simulation.bench.panel import FlatPanel, scattered
+from torchkcreg.simulation.bench.recipe import Recipe, ScannerRecipe
+from torchkcreg.simulation.bench.specimen import Specimen
+from torchkcreg.simulation.bench.standing import parts_in_beam
+from torchkcreg.simulation.parts import Part, material_paths
+
+
+@dataclass(frozen=True, eq=False)
+class Acquisition:
+    """One configuration of an experiment.
+
+    Attributes:
+        name: Of the configuration.
+        loaded: Where everything is.
+        parts: What stands in the beam.
+        counts: Images (V, rows, cols), uint16.
+        scatter_to_primary: What it is behind the object, mean over mean.
+    """
+
+    name: str
+    loaded: Loaded
+    parts: list[Part]
+    counts: Tensor
+    scatter_to_primary: float
+
+
+def acquisitions(
+    specimen: Specimen, geometry: ConeBeamGeometry, spectrum: Spectrum, *, progress: bool = True
+) -> Iterator[Acquisition]:
+    """Each configuration of a specimen's recipe in turn, imaged.
+
+    Args:
+        specimen: Without load.
+        geometry: The views.
+        spectrum: As detected.
+        progress: Show it.
+
+    Raises:
+        ValueError: If the parts do not fit into each other, or a load is impossible.
+    """
+    recipe, construct = specimen.recipe, None
+    if any(any(load.force) for load in recipe.configurations.values()):
+        construct = ElasticConstruct(specimen)
+    panel = panel_of(recipe)
+    for number, (name, load) in enumerate(recipe.configurations.items()):
+        state = loaded(specimen, load, construct)
+        parts = parts_in_beam(specimen, state)
+        primaries = _primaries(geometry, parts, spectrum, recipe.panel.supersample, name if progress else None)
+        scatter = scattered(primaries, geometry.pixel_spacing, recipe.scatter_to_primary)
+        shadow = primaries < 0.9
+        generator = torch.Generator(device="cpu").manual_seed(recipe.seed * 1009 + number)
+        center = torch.tensor(state.mesh(specimen.implant).centroid, dtype=torch.float64, device="cpu")[None]
+        _, depths = geometry.project(center)
+        images = [
+            panel.counts(panel.penumbra(primary, spacing, float(sdd / depth)) + veil, spacing, generator)
+            for primary, veil, sdd, depth, spacing in zip(
+                primaries,
+                scatter,
+                geometry.detector_distances,
+                depths[:, 0],
+                [geometry.pixel_spacing] * geometry.num_views,
+                strict=True,
+            )
+        ]
+        share = float(scatter[shadow].mean() / primaries[shadow].mean()) if bool(shadow.any()) else 0.0
+        yield Acquisition(name, state, parts, torch.stack(images), share)
+
+
+def panel_of(recipe: Recipe) -> FlatPanel:
+    """The detector of a recipe, and its tube's focal spot."""
+    asked = recipe.panel
+    return FlatPanel(
+        focal_spot_mm=recipe.tube.focal_spot,
+        half_contrast_lp_mm=asked.half_contrast_lp_mm,
+        glare=asked.glare,
+        glare_reach_mm=asked.glare_reach,
+        photons=asked.photons if asked.noise else float("inf"),
+        electronic_noise=asked.electronic_noise if asked.noise else 0.0,
+        open_beam=asked.open_beam,
+        offset=asked.offset,
+        bits=asked.bits,
+        gain_error=asked.gain_error,
+        dead_pixels=asked.dead_pixels,
+        seed=recipe.seed,
+    )
+
+
+def views_of(recipe: ScannerRecipe) -> ConeBeamGeometry:
+    """The views of a recipe that names no geometry file.
+
+    Raises:
+        ValueError: If a view is not in the scan.
+    """
+    shape = (recipe.rows, recipe.cols)
+    scanner = MultisourceScanner(
+        sad=recipe.sad,
+        sdd=recipe.sdd,
+        det_shape=shape,
+        det_size_mm=(recipe.rows * recipe.pixel, recipe.cols * recipe.pixel),
+        source_z_mm=recipe.sources,
+        firing_order=recipe.firing_order,
+        num_views=recipe.num_views,
+        step_deg=recipe.step,
+        start_deg=recipe.start,
+        phase_deg=recipe.phase,
+    )
+    whole = scanner.geometry()
+    chosen = whole if recipe.views is None else whole.select(list(recipe.views))
+    return chosen if recipe.binning == 1 else chosen.bin(recipe.binning)
+
+
+def _primaries(
+    geometry: ConeBeamGeometry, parts: list[Part], spectrum: Spectrum, factor: int, label: str | None
+) -> Tensor:
+    """What passes of the beam in each view (V, rows, cols), averaged over pixels, after the exponential."""
+    fine = geometry.refined(factor)
+    beam: Beam | None = None
+    images = []
+    for matrix in tqdm(fine.projection_matrices, desc=label, disable=label is None):
+        paths = material_paths(parts, matrix.cpu(), fine.det_shape)
+        beam = beam or Beam.of([material(name) for name in paths], spectrum, num_bins=None)
+        images.append(beam.transmission(torch.stack(list(paths.values()))[None, :, None], pooling=factor)[0, 0])
+    return torch.stack(images)

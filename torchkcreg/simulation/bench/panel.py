@@ -1,0 +1,151 @@
+"""A flat panel as its physics has it: focal spot, scatter, scintillator, glare, quanta, faults, saturation.
+
+None of it is the registration's own model: blur is a transfer function, not a Gaussian; scatter a sum of kernels whose
+strength and reach depend on what they pass (after Sun and Star-Lack 2010), not a blurred image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, interpolate, pad
+
+_SCATTER_MM = 4.0  # pitch on which scatter is computed: it is smooth
+_KERNELS = ((15.0, 0.5), (40.0, 1.0))  # reach in mm behind thin and thick objects, and how much of it each makes
+_THICK = 2.0  # line integral at which half of the scatter is that of thick objects
+_ABSORBED, _REMOVED = 0.25, 0.9  # scatter comes from p^a ln(1/p)^b
+_SHADOW = 0.9  # primary below which a pixel is behind the object
+_REACHES = 8.0  # of a tail beyond an image
+
+
+@dataclass(frozen=True)
+class FlatPanel:
+    """What happens between the transmitted beam and the numbers in a file.
+
+    Attributes:
+        focal_spot_mm: Width of a square focal spot.
+        half_contrast_lp_mm: Spatial frequency at which the scintillator keeps half of the contrast, `1 / (1 + f^2 /
+            f_half^2)`.
+        glare: Share of the light that spreads in the panel, `exp(-r / reach)`.
+        glare_reach_mm: Its reach.
+        photons: Quanta a pixel of the open beam; infinite: no quantum noise. They are drawn before the scintillator
+            spreads them, so that noise is correlated.
+        electronic_noise: Standard deviation, counts.
+        open_beam: Counts of the open beam.
+        offset: Counts without a beam.
+        bits: The largest count is `2^bits - 1`.
+        gain_error: Standard deviation of what pixels' gains are off after their correction.
+        dead_pixels: Share of pixels that read nothing.
+        seed: Of gains and dead pixels, which are the panel's own.
+    """
+
+    focal_spot_mm: float = 0.3
+    half_contrast_lp_mm: float = 1.6
+    glare: float = 0.06
+    glare_reach_mm: float = 1.5
+    photons: float = 2e4
+    electronic_noise: float = 2.0
+    open_beam: float = 2800.0
+    offset: float = 0.0
+    bits: int = 12
+    gain_error: float = 0.0
+    dead_pixels: float = 0.0
+    seed: int = 0
+
+    @property
+    def saturation(self) -> int:
+        """The largest count, at which a pixel is full."""
+        return 2**self.bits - 1
+
+    def penumbra(self, primary: Tensor, pixel_spacing: Sequence[float], magnification: float) -> Tensor:
+        """The primary (rows, cols) behind objects that the beam magnifies so much, as a focal spot of a size has it."""
+        width = self.focal_spot_mm * (magnification - 1)
+        if width <= 0:
+            return primary
+        return _filtered(primary, pixel_spacing, width, lambda fv, fu: torch.sinc(width * fv) * torch.sinc(width * fu))
+
+    def detected(self, signal: Tensor, pixel_spacing: Sequence[float]) -> Tensor:
+        """What the scintillator makes of a signal (rows, cols): its sharp light and its glare."""
+
+        def transfer(fv: Tensor, fu: Tensor) -> Tensor:
+            squared = fv.square() + fu.square()
+            sharp = 1 / (1 + squared / self.half_contrast_lp_mm**2)
+            tail = (1 + (2 * math.pi * self.glare_reach_mm) ** 2 * squared) ** -1.5
+            return torch.lerp(sharp, tail, self.glare)
+
+        return _filtered(signal, pixel_spacing, self.glare_reach_mm, transfer)
+
+    def counts(self, signal: Tensor, pixel_spacing: Sequence[float], generator: torch.Generator) -> Tensor:
+        """Counts (rows, cols), uint16, of a signal in units of the open beam."""
+        if math.isfinite(self.photons):
+            signal = torch.poisson(signal * self.photons, generator=generator) / self.photons
+        gain, dead = self._faults(signal)
+        counts = self.detected(signal, pixel_spacing) * gain * self.open_beam + self.offset
+        noise = torch.randn(counts.shape, dtype=counts.dtype, generator=generator, device="cpu")
+        counts = (counts + self.electronic_noise * noise).round().clamp(0, self.saturation)
+        return counts.masked_fill(dead, 0).to(torch.int32).to(torch.uint16)
+
+    def _faults(self, signal: Tensor) -> tuple[Tensor, Tensor]:
+        own = torch.Generator(device="cpu").manual_seed(self.seed)
+        normal = torch.randn(signal.shape, dtype=signal.dtype, generator=own, device="cpu")
+        even = torch.rand(signal.shape, dtype=signal.dtype, generator=own, device="cpu")
+        return 1 + self.gain_error * normal, even < self.dead_pixels
+
+
+def scatter_shapes(primaries: Tensor, pixel_spacing: Sequence[float]) -> Tensor:
+    """Scatter (V, rows, cols) behind objects that leave so much of the beam, in arbitrary units.
+
+    Objects go on above and below the panel; beside it is air.
+    """
+    (rows, cols), (dv, du) = primaries.shape[-2:], pixel_spacing
+    coarse_shape = (max(1, round(rows * dv / _SCATTER_MM)), max(1, round(cols * du / _SCATTER_MM)))
+    pitch = [n * d / m for n, d, m in zip((rows, cols), pixel_spacing, coarse_shape, strict=True)]
+    primary = adaptive_avg_pool2d(primaries[:, None], coarse_shape)[:, 0].clamp(1e-9, 1)
+    thickness = -primary.log()
+    source = primary**_ABSORBED * thickness**_REMOVED
+    thick = thickness / (thickness + _THICK)
+    total = torch.zeros_like(primary)
+    for (reach, amount), share in zip(_KERNELS, (1 - thick, thick), strict=True):
+        total = total + amount * _spread(source * share, pitch, reach)
+    return interpolate(total[:, None], size=(rows, cols), mode="bilinear", align_corners=False)[:, 0].clamp_min(0)
+
+
+def scattered(primaries: Tensor, pixel_spacing: Sequence[float], scatter_to_primary: float) -> Tensor:
+    """Scatter (V, rows, cols) whose mean over all shadows is so much of the primary's there."""
+    shadow = primaries < _SHADOW
+    if scatter_to_primary == 0 or not bool(shadow.any()):
+        return torch.zeros_like(primaries)
+    shape = scatter_shapes(primaries, pixel_spacing)
+    return shape * (scatter_to_primary * primaries[shadow].mean() / shape[shadow].mean())
+
+
+def _spread(source: Tensor, pitch: Sequence[float], reach: float) -> Tensor:
+    """Sources (V, rows, cols) spread by a kernel `(1 + (r / reach)^2)^-1.5` of the sum one."""
+    margin = [math.ceil(3 * reach / p) for p in pitch]
+    padded = pad(source[:, None], (0, 0, margin[0], margin[0]), mode="replicate")
+    padded = pad(padded, (margin[1], margin[1]))[:, 0]
+    away = [torch.fft.fftfreq(n, 1 / n, dtype=source.dtype, device="cpu") * p for n, p in zip(padded.shape[1:], pitch)]
+    kernel = (1 + (away[0][:, None].square() + away[1].square()) / reach**2) ** -1.5
+    product = torch.fft.rfft2(padded) * torch.fft.rfft2(kernel / kernel.sum())
+    spread = torch.fft.irfft2(product, s=padded.shape[1:])
+    rows, cols = source.shape[1:]
+    return spread[:, margin[0] : margin[0] + rows, margin[1] : margin[1] + cols]
+
+
+def _filtered(
+    image: Tensor, pixel_spacing: Sequence[float], reach: float, transfer: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor:
+    """An image (rows, cols) by a transfer function of frequencies (fv, fu) in 1/mm; it is mirrored at its edges."""
+    rows, cols = image.shape
+    margins = [
+        min(math.ceil(_REACHES * reach / d) + 4, n - 1) for d, n in zip(pixel_spacing, (rows, cols), strict=True)
+    ]
+    wide = pad(image[None, None], (margins[1], margins[1], margins[0], margins[0]), mode="reflect")[0, 0]
+    fv = torch.fft.fftfreq(wide.shape[0], pixel_spacing[0], dtype=image.dtype, device="cpu")
+    fu = torch.fft.rfftfreq(wide.shape[1], pixel_spacing[1], dtype=image.dtype, device="cpu")
+    found = torch.fft.irfft2(torch.fft.rfft2(wide) * transfer(fv[:, None], fu), s=wide.shape)
+    return found[margins[0] : margins[0] + rows, margins[1] : margins[1] + cols].clamp_min(0)

@@ -1,0 +1,166 @@
+"""What stands in the beam: a specimen's parts where a load takes them, each inside or beside the tissue."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from torchkcreg.simulation.bench.loaded import Loaded
+from torchkcreg.simulation.bench.specimen import DISTAL, PROXIMAL, Specimen
+from torchkcreg.simulation.parts import Part
+from torchkcreg.simulation.solids import Cylinder, Solid, Sphere, Tube
+
+_TISSUE = "tissue"
+_MARROW_GAP_MM = 1e-3
+_SAMPLES = 400  # along an axis
+_SECTIONS = 64  # of a drill
+
+
+def parts_in_beam(specimen: Specimen, state: Loaded) -> list[Part]:
+    """Implant, screws, bone, beads, inserts and tissue where a load takes them.
+
+    Raises:
+        ValueError: If a part lies half inside the tissue, or screws go through a bone's mesh and manifold3d is not
+            installed.
+    """
+    limb, recipe = specimen.recipe.limb, specimen.recipe
+    tissue = _tissue(specimen)
+    around = None if tissue is None else tissue.shape
+    parts = [_placed("plate", state.mesh(specimen.implant), recipe.implant.material, around)]
+    shafts = []
+    for number, (screw, motion) in enumerate(zip(specimen.screws, state.screws, strict=True)):
+        shaft = Cylinder(_tensor(screw.start), _tensor(screw.end), screw.radius)
+        shafts.append(shaft.moved(motion))
+        pushed = _pushed(specimen, screw.start[2])
+        parts.append(_placed(f"screw{number}", shafts[-1], screw.material, around, pushed))
+        if specimen.head is not None:
+            up = (shaft.start - shaft.end) / (shaft.start - shaft.end).norm()
+            cap = Cylinder(shaft.start, shaft.start + specimen.head.height * up, specimen.head.radius).moved(motion)
+            parts.append(_placed(f"head{number}", cap, screw.material, around))
+    parts += _bones(specimen, state, shafts, around)
+    for number, center in enumerate(specimen.beads()):
+        bead = Sphere(center, limb.bead_radius).moved(state.fragments[specimen.fragment_of(float(center[2]))])
+        parts.append(_placed(f"bead{number}", bead, "steel", around))
+    bones = [part for part in parts if isinstance(part.shape, Tube)]
+    for number, rod in enumerate(limb.inserts):
+        for bone in bones:
+            _check_apart(f"insert{number}", (_tensor(rod.start), _tensor(rod.end)), rod.radius, bone)
+        name = rod.material or f"ca{rod.calcium_mg_ml:g}"
+        parts.append(
+            _placed(f"insert{number}", Cylinder(_tensor(rod.start), _tensor(rod.end), rod.radius), name, around)
+        )
+    return parts if tissue is None else [*parts, tissue]
+
+
+def _check_apart(name: str, ends: tuple[Tensor, Tensor], radius: float, bone: Part) -> None:
+    """Raises ValueError where a rod reaches into a bone: neither is taken out of the other."""
+    share = torch.linspace(0, 1, _SAMPLES, dtype=torch.float64, device="cpu")[:, None]
+    assert isinstance(bone.shape, Tube)  # as `_bones` makes it
+    axis = torch.lerp(bone.shape.start, bone.shape.end, share)
+    if float(torch.cdist(torch.lerp(*ends, share), axis).min()) < radius + bone.shape.outer_radius:
+        raise ValueError(f"{name} reaches into the {bone.name} bone: they must not overlap")
+
+
+def _pushed(specimen: Specimen, height: float) -> tuple[str, ...]:
+    """What a screw pushes aside."""
+    limb, fragment = specimen.recipe.limb, specimen.fragment_of(height)
+    found = []
+    if limb.bone is not None:
+        found += [fragment] + ([f"{fragment} marrow"] if limb.bone.marrow else [])
+    return tuple(found + [f"insert{number}" for number in range(len(limb.inserts))])
+
+
+def _bones(
+    specimen: Specimen, state: Loaded, shafts: list[Cylinder], around: trimesh.Trimesh | Solid | None
+) -> list[Part]:
+    limb, bone = specimen.recipe.limb, specimen.recipe.limb.bone
+    parts = []
+    if specimen.bone is not None:
+        parts.append(_placed("bone", _drilled(specimen.bone, shafts), limb.mesh_material, around))
+    if bone is None:
+        return parts
+    for fragment, side in ((DISTAL, -1.0), (PROXIMAL, 1.0)):
+        low, high = (bone.axis[2] + bone.gap_at + side * x for x in (bone.gap / 2, bone.reach))
+        near, far = (_tensor((bone.axis[0], bone.axis[1], z)) for z in (low, high))
+        motion = state.fragments[fragment]
+        tube = Tube(near, far, bone.outer_radius, bone.inner_radius).moved(motion)
+        parts.append(_placed(fragment, tube, bone.material, around))
+        if bone.marrow is not None:
+            core = Cylinder(near, far, bone.inner_radius - _MARROW_GAP_MM).moved(motion)
+            parts.append(_placed(f"{fragment} marrow", core, bone.marrow, around))
+    return parts
+
+
+def _drilled(bone: trimesh.Trimesh, shafts: list[Cylinder]) -> trimesh.Trimesh:
+    """A bone without what screws take of it."""
+    for shaft in shafts:
+        drill = trimesh.creation.cylinder(
+            shaft.radius, segment=torch.stack([shaft.start, shaft.end]).numpy(), sections=_SECTIONS
+        )
+        if not bool((bone.bounds[0] < drill.bounds[1]).all() and (drill.bounds[0] < bone.bounds[1]).all()):
+            continue
+        try:
+            import manifold3d  # noqa: F401
+        except ImportError:
+            raise ValueError("screws in a bone's mesh need manifold3d: pip install 'torchkcreg[simulate]'") from None
+        bone = trimesh.boolean.difference([bone, drill], engine="manifold")
+    return bone
+
+
+def _tissue(specimen: Specimen) -> Part | None:
+    asked, bone = specimen.recipe.limb.tissue, specimen.recipe.limb.bone
+    if asked is None:
+        return None
+    if specimen.tissue is not None:
+        return Part(_TISSUE, specimen.tissue, asked.material)
+    middle = asked.axis or (bone.axis if bone is not None else (0.0, 0.0, 0.0))
+    low, high = (_tensor((middle[0], middle[1], middle[2] + side * asked.half_length)) for side in (-1.0, 1.0))
+    assert asked.radius is not None  # it has no mesh
+    return Part(_TISSUE, Cylinder(low, high, asked.radius), asked.material)
+
+
+def _placed(
+    name: str,
+    shape: trimesh.Trimesh | Solid,
+    of: str,
+    around: trimesh.Trimesh | Solid | None,
+    displaces: tuple[str, ...] = (),
+) -> Part:
+    """A part, inside the tissue or beside it."""
+    if around is None:
+        return Part(name, shape, of, displaces)
+    points = _outline(shape)
+    if isinstance(around, trimesh.Trimesh):
+        inside = torch.from_numpy(around.contains(points.numpy()))
+    else:
+        assert isinstance(around, Cylinder)  # as `_tissue` makes it
+        axis, length = around.end - around.start, float((around.end - around.start).norm())
+        along = (points - around.start) @ axis / length
+        across = (points - around.start - along[:, None] * axis / length).norm(dim=1)
+        inside = (across <= around.radius) & (along >= 0) & (along <= length)
+    if bool(inside.any()) and not bool(inside.all()):
+        raise ValueError(f"the tissue must hold all of {name} or nothing of it")
+    return Part(name, shape, of, displaces, _TISSUE if bool(inside.all()) else None)
+
+
+def _outline(shape: trimesh.Trimesh | Solid) -> Tensor:
+    """Points (n, 3) on a shape that tell where it reaches."""
+    if isinstance(shape, trimesh.Trimesh):
+        return torch.from_numpy(np.array(shape.vertices))
+    if isinstance(shape, Sphere):
+        axes = torch.eye(3, dtype=torch.float64, device="cpu") * shape.radius
+        return shape.center + torch.cat([axes, -axes])
+    radius = shape.outer_radius if isinstance(shape, Tube) else shape.radius
+    axis = shape.end - shape.start
+    first = torch.linalg.cross(axis, torch.eye(3, dtype=axis.dtype, device="cpu")[axis.abs().argmin()])
+    across = torch.stack(
+        [first / first.norm(), torch.linalg.cross(axis, first) / torch.linalg.cross(axis, first).norm()]
+    )
+    rim = torch.cat([across, -across]) * radius
+    return torch.cat([shape.start + rim, shape.end + rim])
+
+
+def _tensor(values: tuple[float, ...]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64, device="cpu")
