@@ -149,6 +149,8 @@ def _add_reconstruct(commands) -> None:
     command.add_argument("--scatter", help="auto (default), none, or its fraction of the primary")
     command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")
     command.add_argument("--material", help="of the implant, where the registration had none")
+    alone = "the object is of this material alone, such as an implant on a bench: fdk gives its share in each voxel"
+    command.add_argument("--single-material", metavar="NAME", help=alone)
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
     existing = command.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the reconstruction that the folder holds")

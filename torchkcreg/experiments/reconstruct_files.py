@@ -18,12 +18,14 @@ from torchkcreg.io import RunFolder, read_config, read_volume, write_volume
 from torchkcreg.physics import material
 from torchkcreg.reconstruction import (
     PWLS,
+    BeamModel,
     FDKConfig,
     PWLSConfig,
     ViewShard,
     fdk,
     hounsfield,
     known_materials,
+    path_lengths_through,
     prepare,
     reconstruct,
     with_components,
@@ -62,7 +64,8 @@ def reconstruct_files(
 ) -> dict[str, Any]:
     """What was measured of a reconstruction whose folder is written to ``out``.
 
-    The folder holds ``volume.mha`` in 1/mm (behind known components the background alone), ``volume_hu.mha``,
+    The folder holds ``volume.mha`` in 1/mm (behind known components the background alone; of a single material the
+    share of it, and no CT numbers), ``volume_hu.mha``,
     ``with_implant.mha`` (with known components), ``metrics.json``, ``config.yaml`` and ``slices.png``. Under
     ``torchrun`` the views are shared out over the processes and the first one writes.
 
@@ -89,7 +92,7 @@ def reconstruct_files(
         volume, history = _reconstructed(files, inputs, options, shard, run, state)
         metrics = _metrics(inputs, options, volume, history, time.perf_counter() - start)
         if run is not None:
-            _write(run, inputs, volume, metrics, figures)
+            _write(run, inputs, options, volume, metrics, figures)
     return metrics
 
 
@@ -103,9 +106,8 @@ def _reconstructed(
 ) -> tuple[Tensor, list[dict[str, Any]]]:
     geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
     if options.method == "fdk":
-        data = prepare(inputs.transmission, geometry, inputs.beam, scatter=inputs.scatter, mask=inputs.mask)
         ramp = FDKConfig(window=options.window)
-        return fdk(data.line_integrals, geometry, grid, config=ramp, shard=shard, backend=backend), []
+        return fdk(_line_integrals(inputs, options), geometry, grid, config=ramp, shard=shard, backend=backend), []
     changes = {name: getattr(options, name) for name in ("iterations", "subsets") if getattr(options, name) is not None}
     config = PWLSConfig.preset(options.preset, beta=options.beta, **changes)
     initial = None
@@ -133,6 +135,14 @@ def _reconstructed(
         progress=None if run is not None else False,
     )
     return result.volume, result.history
+
+
+def _line_integrals(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Tensor:
+    """What FDK takes: line integrals, or path lengths where the object is of one material alone."""
+    alone = options.single_material
+    beam = inputs.beam if alone is None else BeamModel.monoenergetic([])
+    lines = prepare(inputs.transmission, inputs.geometry, beam, scatter=inputs.scatter, mask=inputs.mask).line_integrals
+    return lines if alone is None else path_lengths_through(torch.exp(-lines), material(alone), inputs.spectrum)
 
 
 class _Checkpoints(Callback):
@@ -170,12 +180,19 @@ def _metrics(
 
 
 def _write(
-    run: RunFolder, inputs: ReconstructionInputs, volume: Tensor, metrics: dict[str, Any], figures: bool
+    run: RunFolder,
+    inputs: ReconstructionInputs,
+    options: ReconstructionOptions,
+    volume: Tensor,
+    metrics: dict[str, Any],
+    figures: bool,
 ) -> None:
     grid, beam = inputs.grid, inputs.beam
     shown = {"reconstruction": volume}
     write_volume(run.path / "volume.mha", volume, grid)
-    write_volume(run.path / "volume_hu.mha", hounsfield(volume, beam.water).round().to(torch.int32), grid)
+    shares = options.single_material is not None
+    if not shares:
+        write_volume(run.path / "volume_hu.mha", hounsfield(volume, beam.water).round().to(torch.int32), grid)
     metal = None
     if inputs.components:
         energy = beam.reference_kev
@@ -190,7 +207,7 @@ def _write(
     if figures:
         middle, reach = grid.origin[2] + grid.size_mm[2] / 2, grid.size_mm[2] / 4
         heights = (middle - reach, middle, middle + reach) if grid.shape[0] > 3 else (middle,)
-        window = (0.0, 2 * beam.water)
+        window = (0.0, 1.2 if shares else 2 * beam.water)
         run.write_figure(
             "slices.png", reconstruction_figure(shown, grid, heights_mm=heights, window=window, metal=metal)
         )

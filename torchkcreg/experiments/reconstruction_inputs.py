@@ -70,6 +70,8 @@ class ReconstructionOptions(Config):
         scatter_sigma_mm: How broad a given fraction's scatter is.
         monoenergetic: One energy, as in the paper, even where a spectrum is known.
         material: The implant's, where the registration had none.
+        single_material: What the object is of, where it is of one material alone, such as an implant on a bench: "fdk"
+            gives the share of it in each voxel, without beam hardening.
         backend: Projector: "auto", "cpp" or "torch".
     """
 
@@ -87,6 +89,7 @@ class ReconstructionOptions(Config):
     scatter_sigma_mm: float = Field(40.0, gt=0)
     monoenergetic: bool = False
     material: str | None = None
+    single_material: str | None = None
     backend: Literal["auto", "cpp", "torch"] = "auto"
 
     @property
@@ -108,6 +111,7 @@ class ReconstructionInputs:
         grid: The voxels.
         beam: Energies and the metals' attenuation.
         scatter: Smooth scatter, None for none.
+        spectrum: As detected; a likely one where no file says it.
         components: The metal in its place; none but for "kcrec".
     """
 
@@ -117,6 +121,7 @@ class ReconstructionInputs:
     grid: VolumeGrid
     beam: BeamModel
     scatter: Veil | None
+    spectrum: Spectrum
     components: list[KnownComponent]
 
 
@@ -138,6 +143,11 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         if files.run is None:
             raise ValueError("method kcrec needs the run of a registration: name it with --run")
         components = registered_components(files.run, components=files.components, material=options.material)
+    spectrum = read_spectrum(files.spectrum) if files.spectrum is not None else None
+    if options.single_material is not None:
+        material(options.single_material)
+        if options.method != "fdk":
+            raise ValueError(f"a single material goes with method fdk, not {options.method}")
     if (note := projections.masked_note()) is not None:
         warnings.warn(f"projections file {files.projections}: {note}", stacklevel=2)
     transmission = torch.exp(-filled(projections.line_integrals, projections.mask))
@@ -146,8 +156,9 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         transmission,
         projections.mask,
         _grid(geometry, options),
-        _beam(files, options, components),
+        _beam(spectrum, options, components),
         _scatter(transmission, projections.mask, geometry, options, saturated=projections.num_saturated > 0),
+        spectrum or tungsten_spectrum(),
         components,
     )
 
@@ -174,8 +185,7 @@ def _grid(geometry: ConeBeamGeometry, options: ReconstructionOptions) -> VolumeG
     return VolumeGrid.centered(shape, options.spacing_mm, center=options.center_mm)
 
 
-def _beam(files: ReconstructionFiles, options: ReconstructionOptions, components: list[KnownComponent]) -> BeamModel:
-    spectrum: Spectrum | None = read_spectrum(files.spectrum) if files.spectrum is not None else None
+def _beam(spectrum: Spectrum | None, options: ReconstructionOptions, components: list[KnownComponent]) -> BeamModel:
     metals = [material(name) for name in known_materials(components)]
     if options.monoenergetic or (spectrum is None and not components):
         energy = (spectrum or tungsten_spectrum()).mean_energy

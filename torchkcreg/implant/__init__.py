@@ -8,6 +8,7 @@ from torchkcreg.implant.holes import Hole, find_holes
 from torchkcreg.implant.morton import morton_order
 from torchkcreg.implant.partial_volumes import FilledCells, fill_cells
 from torchkcreg.implant.point_cloud import ImplantPointCloud
+from torchkcreg.implant.scanned import scanned_surface
 from torchkcreg.implant.screws import Screw
 from torchkcreg.implant.voxelize import voxelize_mesh, voxelize_points
 
@@ -25,6 +26,7 @@ __all__ = [
     "fill_cells",
     "find_holes",
     "morton_order",
+    "scanned_surface",
     "volume",
     "voxelize_mesh",
     "voxelize_points",

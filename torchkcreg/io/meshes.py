@@ -11,9 +11,10 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.implant import closed_mesh
+from torchkcreg.implant import closed_mesh, scanned_surface
 from torchkcreg.io.files import atomic_path, existing_file
 from torchkcreg.io.stl import load_stl
+from torchkcreg.io.volumes import VOLUME_SUFFIXES, read_volume
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".3mf")
 _METRES_MM, _SMALLEST_MM, _LARGEST_MM = 1.0, 20.0, 1000.0
@@ -22,6 +23,8 @@ _METRES_MM, _SMALLEST_MM, _LARGEST_MM = 1.0, 20.0, 1000.0
 def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     """The closed surface of an STL, OBJ, PLY, OFF or 3MF file, in mm, oriented outwards.
 
+    Of a volume (MHA, NRRD, NIfTI), a bench scan of the implant, it is the surface where values are half of the metal's,
+    in the volume's world; see `scanned_surface`.
     3MF says its unit and is converted (it needs the package lxml); the others are taken to be in mm.
     Equal vertices are merged, faces that this collapses dropped; several bodies in one file are one surface. A largest
     extent under 1, under 20 or over 1000 mm gives a warning: the file is probably in metres, in cm or inches, or not in
@@ -32,9 +35,11 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         ValueError: it cannot be read as a mesh, is empty, or is open; the message counts the open edges.
     """
     path = existing_file(path, "mesh")
+    if path.name.lower().endswith(VOLUME_SUFFIXES):
+        return _surface_of_volume(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise ValueError(f"mesh file {path} must be one of {', '.join(MESH_SUFFIXES)}")
+        raise ValueError(f"mesh file {path} must be one of {', '.join((*MESH_SUFFIXES, *VOLUME_SUFFIXES))}")
     try:
         stl = suffix == ".stl"
         mesh = load_stl(path.read_bytes()) if stl else trimesh.load(str(path), force="mesh", process=False)
@@ -52,6 +57,16 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         closed.apply_scale(trimesh.units.unit_conversion(mesh.units, "millimeters"))
     _warn_about_size(path, closed)
     return closed
+
+
+def _surface_of_volume(path: Path) -> trimesh.Trimesh:
+    volume, grid = read_volume(path)
+    try:
+        surface = closed_mesh(scanned_surface(volume, grid))
+    except ValueError as error:
+        raise ValueError(f"volume file {path}: {error}") from error
+    _warn_about_size(path, surface)
+    return surface
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:

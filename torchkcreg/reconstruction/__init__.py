@@ -26,6 +26,7 @@ from .pwls_config import PWLSConfig
 from .reconstructed import Reconstruction
 from .roughness import quadratic_roughness
 from .sharding import ViewShard
+from .single_material import path_lengths_through
 from .spectral import BeamModel, background_line_integrals, behind_metal, mineral_part
 from .subsets import ordered_subsets
 from .system import System, VoxelSystem
@@ -59,6 +60,7 @@ __all__ = [
     "known_materials",
     "mineral_part",
     "ordered_subsets",
+    "path_lengths_through",
     "prepare",
     "pwls",
     "quadratic_roughness",
