@@ -14,6 +14,7 @@ from torchkcreg.console import one_line, run_command
 
 from .command import add_command
 from .compare import add_compare
+from .experiment import add_experiment
 from .load import add_load
 from .plan import add_plan
 from .register import add_register
@@ -57,6 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     add_compare(commands)
     add_plan(commands)
     add_simulate(commands)
+    add_experiment(commands)
     add_study(commands)
     _add_reconstruct(commands)
     _add_info(commands)

@@ -71,8 +71,8 @@ def simulate_files(
 ) -> SimulatedFiles:
     """The case folder of a recipe: implant, screws, geometry, spectrum, images of each configuration, truth.
 
-    `NAME.npz` holds the images of a configuration, `truth.json` where beads, nodes and fragments are. Configurations
-    that an earlier call with the same recipe has made are kept.
+    `NAME.npz` holds the images of a configuration, `NAME_implant.stl` the implant under load, `truth.json` where beads,
+    nodes and fragments are. Configurations that an earlier call with the same recipe has made are kept.
 
     Args:
         recipe: YAML or JSON file; files that it names are relative to it. A recipe itself names files as they are.
@@ -103,6 +103,7 @@ def simulate_files(
                 intensity=taken.counts,
                 open_beam=asked.panel.open_beam + asked.panel.offset,
             )
+            write_mesh(out / f"{taken.name}_implant.stl", taken.loaded.mesh(whole.implant))
             truth["cfg"].append(_truth_of(taken, whole))
             truth["cfg"].sort(key=lambda entry: list(asked.configurations).index(entry["name"]))
             write_json(out / TRUTH, truth)
@@ -151,8 +152,9 @@ def _take(out: Path, recipe: Recipe, overwrite: bool) -> None:
             return
         if not overwrite:
             raise FileExistsError(f"folder {out} holds a case of another recipe: replace it with --overwrite")
-        for path in out.glob("*.npz"):
-            path.unlink()
+        for name in read_config(kept).get("configurations") or {}:
+            for ending in (".npz", ".png", "_implant.stl"):
+                (out / f"{name}{ending}").unlink(missing_ok=True)
         (out / TRUTH).unlink(missing_ok=True)
     elif out.is_dir() and (others := sorted({path.name for path in out.iterdir()} - _OWN)):
         raise FileExistsError(f"folder {out} holds something else ({others[0]}): choose another one")

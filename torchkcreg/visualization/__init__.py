@@ -13,6 +13,7 @@ from .load import load_figure
 from .overlay import overlay_figure
 from .plan import plan_figure
 from .reconstruction import reconstruction_figure
+from .series import series_figure
 
 __all__ = [
     "capture_figure",
@@ -26,4 +27,5 @@ __all__ = [
     "overlay_figure",
     "plan_figure",
     "reconstruction_figure",
+    "series_figure",
 ]

@@ -1,0 +1,30 @@
+"""``torchkcreg experiment``: the paper's two experiments."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .command import add_command
+
+
+def add_experiment(commands) -> None:
+    """Adds the command."""
+    text = "simulate, register and evaluate the paper's experiments: tables and figures; what is there is kept"
+    command = add_command(commands, "experiment", _experiment, text)
+    names = ("tibial-plate", "femoral-plate")
+    command.add_argument("name", choices=names, metavar="NAME", help=" or ".join(names))
+    command.add_argument("--quick", action="store_true", help="few loads and views, coarse pixels: a few minutes")
+    command.add_argument("--blind", action="store_true", help="screws and spectrum are not told")
+    command.add_argument(
+        "--paper", action="store_true", help="with the paper's own settings, too: minutes for each load"
+    )
+    command.add_argument("--out", type=Path, help="folder to make, or to go on with (default: NAME)")
+
+
+def _experiment(options: argparse.Namespace) -> None:
+    from torchkcreg.experiments.paper import femoral_plate, tibial_plate
+
+    run = {"tibial-plate": tibial_plate, "femoral-plate": femoral_plate}[options.name]
+    out = options.out or Path(options.name)
+    print(f"\n{run(out, quick=options.quick, known=not options.blind, paper=options.paper)}\n\nfolder {out}")

@@ -1,0 +1,113 @@
+"""Steps of an experiment, each of which is kept in a folder of its own and not taken twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from torchkcreg.experiments.inputs import RegistrationFiles
+from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
+from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles
+from torchkcreg.experiments.register_files import register_files
+from torchkcreg.experiments.simulate_files import simulate_files
+from torchkcreg.geometry import rigid_matrix
+from torchkcreg.io import read_json, read_run, write_init
+from torchkcreg.registration import RegistrationResult
+from torchkcreg.simulation.bench import Recipe
+
+PAPER_SETTINGS = {"preset": "paper", "deformation": "ffd", "find_screws": False, "view_motion": "off"}
+_START_DEG, _START_MM = (0.8, -0.6, 1.0), (1.0, -1.2, 0.8)  # by which a registration's start is off
+
+
+def packaged(name: str) -> dict[str, Any]:
+    """The recipe of an experiment, as its file has it."""
+    text = (resources.files("torchkcreg.experiments.paper") / f"{name}.yaml").read_text(encoding="utf-8")
+    content: dict[str, Any] = yaml.safe_load(text)
+    return content
+
+
+def simulated(content: Mapping[str, Any], folder: Path, **changes: Any) -> Path:
+    """The case folder of a recipe with changes on top; what is there is kept."""
+    simulate_files(Recipe.of({**content, **changes}, "recipe"), folder)
+    return folder
+
+
+def start_of(folder: Path) -> Path:
+    """A file with a start pose that is off by one and a half millimetres and degrees."""
+    import torch
+
+    folder.mkdir(parents=True, exist_ok=True)
+    turn = torch.deg2rad(torch.tensor(_START_DEG, dtype=torch.float64, device="cpu"))
+    pose = rigid_matrix(turn, torch.tensor(_START_MM, dtype=torch.float64, device="cpu"))
+    write_init(folder / "start.json", pose)
+    return folder / "start.json"
+
+
+def registered(
+    case: Path,
+    configuration: str,
+    views: list[int],
+    run: Path,
+    *,
+    start: Path,
+    options: Mapping[str, Any],
+    known: bool = True,
+    implant: Path | None = None,
+    figures: bool = True,
+) -> RegistrationResult:
+    """The registration of a configuration, in its run folder; one that was broken off goes on.
+
+    Args:
+        case: Folder of the simulated case.
+        configuration: Of it.
+        views: Of the case that are used.
+        run: Folder.
+        start: File of the start pose.
+        options: Of the registration.
+        known: Screws and spectrum are told.
+        implant: Another model of the undeformed implant than the case's.
+        figures: Draw the run.
+    """
+    if (run / "deformation.json").exists():
+        return read_run(run)
+    files = RegistrationFiles(
+        implant=implant or case / "implant.stl",
+        geometry=case / "geometry.json",
+        projections=case / f"{configuration}.npz",
+        spectrum=case / "spectrum.csv" if known else None,
+        components=case / "screws.json" if known else None,
+        init=start,
+        views=views,
+    )
+    return register_files(files, run, overrides=dict(options), resume=run.exists(), figures=figures)
+
+
+def seconds_of(folder: Path) -> float:
+    """How long a run or a reconstruction took."""
+    return float(read_json(folder / "metrics.json", "metrics")["seconds"])
+
+
+def reconstructed(case: Path, configuration: str, out: Path, *, run: Path | None = None, **options: Any) -> Path:
+    """The volume of a configuration's scan; one that is there is kept."""
+    volume = out / "volume.mha"
+    if not (out / "metrics.json").exists():
+        files = ReconstructionFiles(
+            run=run,
+            geometry=case / "geometry.json",
+            projections=case / f"{configuration}.npz",
+            spectrum=case / "spectrum.csv",
+        )
+        reconstruct_files(files, out, resolve_options(options), resume=(out / "config.yaml").exists())
+    return volume
+
+
+def bench_model(implant: Mapping[str, Any], out: Path, *, size_mm: tuple[float, float, float]) -> Path:
+    """The volume of an undeformed implant's scan on a bench: FDK on voxels of 0.25 mm, the share of its metal."""
+    content = packaged("bench")
+    case = simulated({**content, "implant": dict(implant)}, out / "scan")
+    alone = {"method": "fdk", "single_material": implant["material"], "scatter": "none"}
+    return reconstructed(case, "bench", out / "fdk", spacing_mm=0.25, size_mm=size_mm, **alone)
