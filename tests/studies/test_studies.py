@@ -11,6 +11,7 @@ import torch
 from torchkcreg.cli import main
 from torchkcreg.geometry import circular_geometry
 from torchkcreg.studies import STUDIES, StudyOptions, run_study, simulated, wrong_geometry
+from torchkcreg.studies.loads import recipe_of, registered_load
 from torchkcreg.studies.simulated import WIDTHS
 from torchkcreg.studies.studies import Study
 from torchkcreg.studies.wrong_geometry import with_source
@@ -56,14 +57,14 @@ def test_none_is_no_error_and_another_is_refused():
 def row_of(job):
     """What a registration might say of a case."""
     seed = job["seed"]
-    off = (
-        0.05 + 0.021 * seed + (0.5 if job["geometry"] != "none" and job["options"].get("view_motion") != "auto" else 0)
-    )
+    wrong = job.get("geometry", "none") != "none" and job["options"].get("view_motion") != "auto"
+    off = 0.05 + 0.021 * seed + (0.5 if wrong else 0)
     coverage = {f"{what} {part}": [min(1.0, 0.4 * w) for w in WIDTHS] for what in ("nodes", "beads") for part in "ab"}
     return {
         **{name: off for name in ("nodes", "shape", "beads", "worst", "node_std_mm", "expected_mm")},
         **{"seed": seed, "gc": 0.9, "azimuth": 10.0 * seed, "scatter": 0.1, "seconds": 1.0, "coverage": coverage},
         **{"status": "ok", "warnings": "", "view_motion_mm": None, "planned": job.get("random", 0) is None},
+        **{"load_n": job.get("load_n"), "views": job["views"], "photons": job.get("photons")},
         **{"gap_true": 1000.0, "gap_found": 1010.0, "gap_std": 20.0},
         **{"largest_true": -900.0, "largest_found": -700.0, "largest_std": 50.0},
     }
@@ -74,7 +75,7 @@ def pretended(monkeypatch):
     """Studies whose registrations are pretended."""
     monkeypatch.setattr("torchkcreg.studies.studies.simulated", row_of)
     whole = {name: Study(s.text, s.jobs, s.function, s.report) for name, s in STUDIES.items()}
-    for name in ("population", "views"):
+    for name in ("population", "views", "loads"):
         whole[name] = Study(whole[name].text, whole[name].jobs, row_of, whole[name].report)
     monkeypatch.setattr("torchkcreg.studies.studies.STUDIES", whole)
 
@@ -86,6 +87,7 @@ def pretended(monkeypatch):
         ("coverage", {"coverage.png"}, "three views a degree apart (3 cases) | 40%, 78%"),
         ("geometry", {"geometry.csv", "geometry.png"}, "| limb | 3 | 0.571, 0.571 | 0.071, 0.071 | 0 of 3 |"),
         ("views", {"views.csv", "views.png"}, "in 0 of 30 draws, 3 cases"),
+        ("loads", {"loads.csv", "loads.png"}, "| 600 N | 0.071 | 0.071 | 0.071 | 0.071 |"),
     ],
 )
 def test_a_study_writes_table_and_figures_and_is_taken_up(name, files, told, pretended, tmp_path, monkeypatch):
@@ -93,6 +95,23 @@ def test_a_study_writes_table_and_figures_and_is_taken_up(name, files, told, pre
     assert told in text and {path.name for path in (tmp_path / "out").iterdir()} == files | {"jobs.jsonl"}
     monkeypatch.setattr("torchkcreg.studies.studies.simulated", None)  # nothing is run again
     assert run_study(name, StudyOptions(cases=3), tmp_path / "out", workers=1) == (rows, text)
+
+
+def test_a_job_of_the_study_of_loads_is_an_experiment_of_its_own():
+    jobs = STUDIES["loads"].jobs(StudyOptions(cases=2, known=True))
+    assert len(jobs) == 2 * 6 * 2 * 2
+    one, other = (recipe_of(next(j for j in jobs if j["seed"] == seed and j["load_n"] == 400.0)) for seed in (0, 1))
+    assert one.configurations["loaded"].force == (0.0, 0.0, -400.0)
+    assert one.configurations["loaded"].translation != other.configurations["loaded"].translation
+    assert one.panel.photons == 5000.0
+    assert one.scanner.views == (91, 92, 93)
+
+
+@pytest.mark.slow
+def test_a_load_is_registered():
+    job = STUDIES["loads"].jobs(StudyOptions(cases=1, known=True))[0]
+    row = registered_load({**job, "load_n": 300.0})
+    assert row["nodes"] < 0.15 and row["beads"] < 0.25 and row["load_n"] == 300.0
 
 
 def test_silent_failures_and_loads_are_told(pretended, tmp_path):

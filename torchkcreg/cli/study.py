@@ -14,7 +14,7 @@ def add_study(commands) -> None:
     """Adds the command."""
     text = "register many simulated cases: errors, error bars, wrong geometries, planned views"
     command = add_command(commands, "study", _study, text)
-    names = ("population", "coverage", "geometry", "views")
+    names = ("population", "coverage", "geometry", "loads", "views")
     command.add_argument("name", choices=names, metavar="NAME", help=", ".join(names))
     command.add_argument("--cases", type=int, help="how many cases (default: what the study usually has)")
     command.add_argument("--first", type=int, default=0, help="seed of the first case")

@@ -14,6 +14,7 @@ from torchkcreg.visualization.studies import (
     coverage_figure,
     errors_figure,
     geometry_figure,
+    loads_figure,
     planned_figure,
     verdict_figure,
 )
@@ -109,6 +110,27 @@ def of_geometry(rows: Sequence[Row], folder: Path) -> str:
         moved = sum(bool(r["views_moved"]) for r in own["auto"])
         table.append([name, str(len(own["off"])), *cells, f"{moved} of {len(own['auto'])}"])
     return markdown_table(header, table)
+
+
+def of_loads(rows: Sequence[Row], folder: Path) -> str:
+    """Median errors for each load, set of views and number of quanta."""
+    write_rows(folder / "loads.csv", rows)
+    rows = [row for row in rows if "error" not in row]
+    kinds = sorted({(int(row["views"]), row["photons"]) for row in rows})
+    loads = sorted({row["load_n"] for row in rows})
+    curves = {
+        f"{views} views, {photons:.0f} photons": [
+            [r["nodes"] for r in rows if (int(r["views"]), r["photons"], r["load_n"]) == (views, photons, load)]
+            for load in loads
+        ]
+        for views, photons in kinds
+    }
+    write_figure(folder / "loads.png", loads_figure(loads, curves), dpi=110)
+    cells = [
+        [f"{load:.0f} N", *(f"{np.median(errors[n]):.3f}" if errors[n] else "-" for errors in curves.values())]
+        for n, load in enumerate(loads)
+    ]
+    return markdown_table(["node RMSE (median, mm)", *curves], cells)
 
 
 def of_views(rows: Sequence[Row], folder: Path) -> str:

@@ -13,7 +13,8 @@ from torchkcreg.experiments.capture import registration_inputs
 from torchkcreg.registration import RegistrationConfig, build_scene, view_information
 from torchkcreg.simulation import draw_case
 
-from .reports import of_coverage, of_geometry, of_population, of_views
+from .loads import load_jobs, registered_load
+from .reports import of_coverage, of_geometry, of_loads, of_population, of_views
 from .simulated import made_case, registered, simulated
 from .sweeps import Job, Row, sweep
 from .wrong_geometry import ERRORS
@@ -158,9 +159,14 @@ def planned(job: Job) -> Row:
     return {**row, "chosen": chosen, "expected_mm": round(expected, 4), "planned": job["random"] is None}
 
 
+def _loads(options: StudyOptions) -> list[Job]:
+    return load_jobs(options.seeds(2), known=options.known, options=options.options)
+
+
 STUDIES = {
     "population": Study("errors and verdicts of randomly drawn cases", _population, simulated, of_population),
     "coverage": Study("how often error bars hold the truth", _coverage, covered, of_coverage),
     "geometry": Study("what a geometry that is off costs, and what is won back", _geometry, corrected, of_geometry),
+    "loads": Study("loads in newton, views and noise, on the tibial plate", _loads, registered_load, of_loads),
     "views": Study("whether planned views beat random ones", _views, planned, of_views),
 }

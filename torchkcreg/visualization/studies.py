@@ -95,6 +95,27 @@ def geometry_figure(
     return figure
 
 
+def loads_figure(loads: Sequence[float], curves: Mapping[str, Sequence[Sequence[float]]]) -> Figure:
+    """Errors over the load: every registration a dot, medians joined.
+
+    Args:
+        loads: N.
+        curves: Errors in mm for each load, by what they were registered with.
+    """
+    figure = Figure(figsize=(6.0, 3.8), layout="constrained", facecolor="white")
+    axis = figure.subplots()
+    for (name, errors), colour in zip(curves.items(), (_RED, _AMBER, _BLUE, _SKY), strict=False):
+        there = [(load, some) for load, some in zip(loads, errors, strict=True) if some]
+        axis.scatter(
+            [x for x, some in there for _ in some], [y for _, some in there for y in some], 12, colour, alpha=0.5
+        )
+        axis.plot([x for x, _ in there], [float(np.median(some)) for _, some in there], color=colour, label=name)
+    axis.set(xlabel="axial load (N)", ylabel="error of the nodes (mm, RMS)")
+    axis.set_ylim(bottom=0)
+    axis.legend(frameon=False)
+    return figure
+
+
 def planned_figure(expected: Sequence[float], found: Sequence[float], planned: Sequence[bool]) -> Figure:
     """Errors of sets of views against what was expected of them before any image; planned sets are filled."""
     figure = Figure(figsize=(5.0, 4.2), layout="constrained", facecolor="white")

@@ -39,7 +39,12 @@ class Acquisition:
 
 
 def acquisitions(
-    specimen: Specimen, geometry: ConeBeamGeometry, spectrum: Spectrum, *, progress: bool = True
+    specimen: Specimen,
+    geometry: ConeBeamGeometry,
+    spectrum: Spectrum,
+    *,
+    progress: bool = True,
+    construct: ElasticConstruct | None = None,
 ) -> Iterator[Acquisition]:
     """Each configuration of a specimen's recipe in turn, imaged.
 
@@ -48,12 +53,13 @@ def acquisitions(
         geometry: The views.
         spectrum: As detected.
         progress: Show it.
+        construct: Of the specimen, where it has been made already: making it takes seconds.
 
     Raises:
         ValueError: If the parts do not fit into each other, or a load is impossible.
     """
-    recipe, construct = specimen.recipe, None
-    if any(any(load.force) for load in recipe.configurations.values()):
+    recipe = specimen.recipe
+    if construct is None and any(any(load.force) for load in recipe.configurations.values()):
         construct = ElasticConstruct(specimen)
     panel = panel_of(recipe)
     for number, (name, load) in enumerate(recipe.configurations.items()):
