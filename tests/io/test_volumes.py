@@ -40,3 +40,18 @@ def test_what_is_no_volume_is_named(tmp_path):
         read_volume(tmp_path / "broken.mha")
     with pytest.raises(FileNotFoundError):
         read_volume(tmp_path / "none.mha")
+
+
+@pytest.mark.parametrize("name", ["v.mha", "v.nrrd"])
+def test_a_header_that_asks_for_more_than_its_file_holds_is_refused_before_anything_is_allocated(tmp_path, name):
+    write_volume(tmp_path / name, torch.zeros(3, 4, 5), VolumeGrid((3, 4, 5), 1.0))
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content.replace(b"5 4 3", b"90000 90000 900"))
+    with pytest.raises(ValueError, match="its header asks for 7290000000000 values"):
+        read_volume(tmp_path / name)
+
+
+def test_an_empty_volume_packs_well_and_is_read(tmp_path):
+    write_volume(tmp_path / "v.mha", torch.zeros(120, 128, 128), VolumeGrid((120, 128, 128), 1.0))
+    assert (tmp_path / "v.mha").stat().st_size < 20_000
+    assert float(read_volume(tmp_path / "v.mha")[0].abs().max()) == 0

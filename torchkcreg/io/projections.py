@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.io.files import atomic_path, existing_file
+from torchkcreg.io.images import read_image
 from torchkcreg.io.plausible import ImageHeader, implausible_images, stuck_pixels
 from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
 
@@ -150,7 +151,7 @@ def _load(path: Path) -> tuple[dict[str, NDArray], ImageHeader | None]:
                 return {key: file[key] for key in _ARRAYS if key in file.files}, None
         if suffix == ".npy":
             return {"image": np.asarray(np.load(path, allow_pickle=False))}, None
-        image = sitk.ReadImage(str(path))
+        image = read_image(path)
         return {"image": sitk.GetArrayFromImage(image)}, ImageHeader.of(image)
     except Exception as error:  # NumPy, zip archives and ITK's readers fail in many ways, and each means a damaged file
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]

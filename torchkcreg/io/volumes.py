@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid
 from torchkcreg.io.files import atomic_path, existing_file
+from torchkcreg.io.images import read_image
 
 VOLUME_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nii", ".nii.gz")
 
@@ -49,7 +50,7 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Tensor, VolumeGrid]:
     if not path.name.lower().endswith(VOLUME_SUFFIXES):
         raise ValueError(f"volume file {path} must be one of {', '.join(VOLUME_SUFFIXES)}")
     try:
-        image = sitk.ReadImage(str(path))
+        image = read_image(path)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1:] or ["unknown"]
         raise ValueError(f"volume file {path} cannot be read: {reason[0]}") from error

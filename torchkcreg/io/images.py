@@ -1,0 +1,28 @@
+"""Image files through ITK, their sizes checked against their files before anything is allocated."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import SimpleITK as sitk
+
+_MOST_PACKED = 5000  # how many times larger than its file an image can be: deflate and LZW pack less
+_SMALLEST = 1 << 16  # bytes: what is not worth the question
+_DETACHED = (".mhd", ".nhdr")  # headers whose data are in another file
+
+
+def read_image(path: Path) -> sitk.Image:
+    """The image of a file.
+
+    Raises:
+        RuntimeError: It cannot be read, or its header asks for more than the file can hold.
+    """
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(path))
+    reader.ReadImageInformation()
+    needed = math.prod(reader.GetSize()) * reader.GetNumberOfComponents()  # of a byte or more each
+    file = path.stat().st_size
+    if path.suffix.lower() not in _DETACHED and needed > max(_SMALLEST, _MOST_PACKED * file):
+        raise RuntimeError(f"its header asks for {needed} values, more than a file of {file} bytes can hold")
+    return reader.Execute()
