@@ -51,11 +51,10 @@ class Elasticity:
         """Mean energy density over Young's modulus, shape (K,); half a squared strain."""
         return strain_energy(self.gradients(steps), self.volumes)
 
-    def strains(self, steps: Tensor) -> Tensor:
-        """Green-Lagrange strains, (K, 9 N), so weighted that half their squares sum to the energy."""
-        gradients = self.gradients(steps)
-        strain = 0.5 * (gradients.mT @ gradients - torch.eye(3, dtype=steps.dtype, device=steps.device))
-        return (strain * self.share[:, None, None]).flatten(1)
+    def small_strains(self, steps: Tensor) -> Tensor:
+        """Strains of small steps from rest, (K, 9 N), so weighted that half their squares sum to the energy."""
+        gradients = (self.slopes @ steps[:, None]).mT
+        return (0.5 * (gradients + gradients.mT) * self.share[:, None, None]).flatten(1)
 
     def displacements(self, steps: Tensor) -> Tensor:
         """Displacements, (K, 3 N), so weighted that their squares sum to the mean square, mm^2."""

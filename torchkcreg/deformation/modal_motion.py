@@ -99,9 +99,8 @@ class ModalMotion(Motion):
 def _derivatives(groups: GroupMotion, elasticity: Elasticity) -> tuple[Tensor, Tensor, Tensor]:
     """At rest: those (P, S) of the displacements, and the second ones (P, P) of their mean square and of the energy."""
     offsets = _DIFFERENCE_MM * torch.eye(groups.num_parameters, dtype=torch.float64, device=groups.centers.device)
-    ahead, behind = groups.in_grid(offsets), groups.in_grid(-offsets)
-    moves = (elasticity.displacements(ahead) - elasticity.displacements(behind)) / (2 * _DIFFERENCE_MM)
-    strains = (elasticity.strains(ahead) - elasticity.strains(behind)) / (2 * _DIFFERENCE_MM)
+    slopes = (groups.in_grid(offsets) - groups.in_grid(-offsets)) / (2 * _DIFFERENCE_MM)
+    moves, strains = elasticity.displacements(slopes), elasticity.small_strains(slopes)
     return moves, moves @ moves.T, strains @ strains.T
 
 

@@ -121,9 +121,15 @@ class Assembly(ExactModule):
 
     def placement(self, nodes: Tensor) -> Placement:
         """Where nodes (N, 3) of the implant's frame, and the components, are now, as one candidate."""
-        motions = [self.motion_at(head) for head in self.heads]
-        poses = torch.stack([self.implant_to_world, *(self.implant_to_world @ motion for motion in motions)])[1:]
+        poses = torch.stack([self.implant_to_world, *(self.implant_to_world @ m for m in self._motions())])[1:]
         return Placement(self.warp(nodes).to(nodes)[None], (poses @ rotation_about(self.heads, self.tilts))[None])
+
+    def _motions(self) -> list[Tensor]:
+        """Rigid motion (4, 4) of each component in the implant's frame, all of what they follow moved at once."""
+        if not self.followed:
+            return []
+        moved = self.deformation(torch.cat(self.followed)).split([len(points) for points in self.followed])
+        return [fit_rigid(points, there) for points, there in zip(self.followed, moved, strict=True)]
 
     def motion_at(self, head: Tensor) -> Tensor:
         """Rigid motion (4, 4) in the implant's frame of a component whose head is there, a point (3,)."""
@@ -133,7 +139,7 @@ class Assembly(ExactModule):
     def component_motions(self) -> dict[str, Tensor]:
         """Rigid motion (4, 4) of each component in the implant's frame."""
         turns = rotation_about(self.heads, self.tilts)
-        return {c.name: self.motion_at(c.head) @ t for c, t in zip(self.components, turns, strict=True)}
+        return {c.name: m @ t for c, m, t in zip(self.components, self._motions(), turns, strict=True)}
 
     @torch.no_grad()
     def rms_strain(self) -> float:
