@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import yaml
 
 import torchkcreg
 from torchkcreg.geometry import circular_geometry
@@ -26,6 +27,7 @@ from torchkcreg.simulation.bench import (
     specimen,
     views_of,
 )
+from torchkcreg.simulation.bench.standing import parts_in_beam
 
 MONO = Spectrum((60.0,), (1.0,))
 QUIET = {"noise": False, "glare": 0, "half_contrast_lp_mm": 1e6, "bits": 16, "open_beam": 6e4}
@@ -88,6 +90,14 @@ def test_wrong_recipes_are_refused_in_a_line(changes, message):
 def test_a_recipe_that_is_written_is_read_again():
     recipe = small(limb={"tissue": {"radius": "4 cm"}}, configurations={"a": {"force": "[1, 2, 3] N"}})
     assert Recipe.of(plain(recipe.model_dump(mode="json"))) == recipe
+
+
+def test_the_recipe_in_the_docs_is_right_and_its_parts_fit():
+    text = (Path(__file__).resolve().parents[2] / "docs" / "experiments.md").read_text(encoding="utf-8")
+    recipe = Recipe.of(yaml.safe_load(text.split("```yaml")[1].split("```")[0]))
+    made = specimen(recipe)
+    names = {part.name for part in parts_in_beam(made, loaded(made, recipe.configurations["unloaded"]))}
+    assert {"plate", "screw5", "head0", "distal", "bead1", "insert0", "tissue"} <= names
 
 
 def test_screws_stand_in_the_holes_that_are_named_tilted_and_into_the_bone():
