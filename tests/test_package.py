@@ -70,7 +70,8 @@ def test_every_flag_in_the_readme_exists(capsys):
     from torchkcreg.cli import main
 
     texts = []
-    for command in ("register", "warp", "evaluate", "load", "compare", "plan", "study", "reconstruct", "info", "demo"):
+    made = ("simulate", "experiment", "study", "demo")
+    for command in ("register", "warp", "evaluate", "load", "compare", "plan", "reconstruct", "info", *made):
         assert main([command, "--help"]) == 0
         texts.append(capsys.readouterr().out)
     flags = set(re.findall(r"(?<![\w-])--[a-z]+(?:-[a-z]+)*", README)) - {"--no-build-isolation"}
