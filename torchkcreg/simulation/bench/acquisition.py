@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
+import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
 from torchkcreg.physics import Beam, Spectrum, material
 from torchkcreg.simulation.bench.loaded import ElasticConstruct, Loaded, loaded
-from torchkcreg.simulation.bench.panel import FlatPanel, scattered
+from torchkcreg.simulation.bench.panel import FlatPanel, mean_ratio, scattered
 from torchkcreg.simulation.bench.recipe import Recipe, ScannerRecipe
 from torchkcreg.simulation.bench.specimen import Specimen
 from torchkcreg.simulation.bench.standing import parts_in_beam
@@ -61,29 +62,27 @@ def acquisitions(
     recipe = specimen.recipe
     if construct is None and any(any(load.force) for load in recipe.configurations.values()):
         construct = ElasticConstruct(specimen)
-    panel = panel_of(recipe)
+    panel, spacing = panel_of(recipe), geometry.pixel_spacing
     for number, (name, load) in enumerate(recipe.configurations.items()):
         state = loaded(specimen, load, construct)
         parts = parts_in_beam(specimen, state)
         primaries = _primaries(geometry, parts, spectrum, recipe.panel.supersample, name if progress else None)
-        scatter = scattered(primaries, geometry.pixel_spacing, recipe.scatter_to_primary)
-        shadow = primaries < 0.9
+        scatter = scattered(primaries, spacing, recipe.scatter_to_primary)
         generator = torch.Generator(device="cpu").manual_seed(recipe.seed * 1009 + number)
-        center = torch.tensor(state.mesh(specimen.implant).centroid, dtype=torch.float64, device="cpu")[None]
-        _, depths = geometry.project(center)
+        magnifications = _magnifications(geometry, state.mesh(specimen.implant))
         images = [
-            panel.counts(panel.penumbra(primary, spacing, float(sdd / depth)) + veil, spacing, generator)
-            for primary, veil, sdd, depth, spacing in zip(
-                primaries,
-                scatter,
-                geometry.detector_distances,
-                depths[:, 0],
-                [geometry.pixel_spacing] * geometry.num_views,
-                strict=True,
-            )
+            panel.counts(panel.penumbra(primary, spacing, magnified) + veil, spacing, generator)
+            for primary, veil, magnified in zip(primaries, scatter, magnifications, strict=True)
         ]
-        share = float(scatter[shadow].mean() / primaries[shadow].mean()) if bool(shadow.any()) else 0.0
-        yield Acquisition(name, state, parts, torch.stack(images), share)
+        yield Acquisition(name, state, parts, torch.stack(images), mean_ratio(scatter, primaries))
+
+
+def _magnifications(geometry: ConeBeamGeometry, implant: trimesh.Trimesh) -> list[float]:
+    """How much each view magnifies the implant's middle."""
+    middle = torch.tensor(implant.centroid, dtype=torch.float64, device="cpu")
+    _, depths = geometry.project(middle[None])
+    magnified: list[float] = (geometry.detector_distances / depths[:, 0]).tolist()
+    return magnified
 
 
 def panel_of(recipe: Recipe) -> FlatPanel:

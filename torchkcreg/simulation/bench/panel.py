@@ -116,11 +116,16 @@ def scatter_shapes(primaries: Tensor, pixel_spacing: Sequence[float]) -> Tensor:
 
 def scattered(primaries: Tensor, pixel_spacing: Sequence[float], scatter_to_primary: float) -> Tensor:
     """Scatter (V, rows, cols) whose mean over all shadows is so much of the primary's there."""
-    shadow = primaries < _SHADOW
-    if scatter_to_primary == 0 or not bool(shadow.any()):
+    if scatter_to_primary == 0 or not bool((primaries < _SHADOW).any()):
         return torch.zeros_like(primaries)
     shape = scatter_shapes(primaries, pixel_spacing)
-    return shape * (scatter_to_primary * primaries[shadow].mean() / shape[shadow].mean())
+    return shape * (scatter_to_primary / mean_ratio(shape, primaries))
+
+
+def mean_ratio(scatter: Tensor, primaries: Tensor) -> float:
+    """Mean scatter over mean primary in all shadows; zero where there is none."""
+    shadow = primaries < _SHADOW
+    return float(scatter[shadow].mean() / primaries[shadow].mean()) if bool(shadow.any()) else 0.0
 
 
 def _spread(source: Tensor, pitch: Sequence[float], reach: float) -> Tensor:
