@@ -163,3 +163,16 @@ def test_known_components_take_two_passes_unless_told_otherwise() -> None:
     assert ReconstructionOptions(method="kcrec").num_passes == 2
     assert ReconstructionOptions(method="kcrec", passes=1).num_passes == 1
     assert ReconstructionOptions(method="pwls").num_passes == 1
+
+
+def test_scatter_may_be_what_the_registration_found(ball_scan, small_run, tmp_path, capsys):
+    assert main(arguments(ball_scan, tmp_path / "a", "--scatter", "run")) == 2
+    assert "needs its run: name it with --run" in capsys.readouterr().err
+    means = {}
+    for scatter in ("run", "none"):
+        out = tmp_path / scatter
+        assert main(arguments(ball_scan, out, "--run", small_run, "--scatter", scatter, "--no-figures")) == 0
+        volume, grid = read_volume(out / "volume.mha")
+        means[scatter] = float(volume[grid.points().norm(dim=-1) < 14].mean())
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())["scatter"]["mean_of_run"]
+    assert found > 0 and means["run"] > means["none"]  # less signal is primary: the ball is denser

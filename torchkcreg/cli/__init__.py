@@ -148,7 +148,7 @@ def _add_reconstruct(commands) -> None:
         "--passes", type=int, help="2: correct for mineral and scatter behind metal, from pass 1 (default of kcrec)"
     )
     command.add_argument("--window", help="of the ramp: ram-lak, shepp-logan, cosine, hamming or hann (default)")
-    command.add_argument("--scatter", help="auto (default), none, or its fraction of the primary")
+    command.add_argument("--scatter", help="auto (default), run (as found), none, or its fraction")
     command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")
     command.add_argument("--material", help="of the implant, where the registration had none")
     alone = "the object is of this material alone, such as an implant on a bench: fdk gives its share in each voxel"

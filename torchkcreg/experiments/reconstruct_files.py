@@ -21,6 +21,7 @@ from torchkcreg.reconstruction import (
     BeamModel,
     FDKConfig,
     PWLSConfig,
+    Veil,
     ViewShard,
     fdk,
     hounsfield,
@@ -163,7 +164,7 @@ def _metrics(
     history: list[dict[str, Any]],
     seconds: float,
 ) -> dict[str, Any]:
-    scatter, beam = inputs.scatter, inputs.beam
+    beam = inputs.beam
     return {
         "shape": list(volume.shape),
         "spacing_mm": list(inputs.grid.spacing),
@@ -171,12 +172,20 @@ def _metrics(
         "largest": float(volume.max()),
         "reference_kev": beam.reference_kev,
         "water": beam.water,
-        "scatter": None if scatter is None else {"fraction": scatter.fraction, "sigma_mm": scatter.sigma_mm},
+        "scatter": _scatter_in_words(inputs.scatter),
         "components": [component.material for component in inputs.components],
         "passes": None if options.method == "fdk" else options.num_passes,
         "history": history,
         "seconds": seconds,
     }
+
+
+def _scatter_in_words(scatter: Veil | Tensor | None) -> dict[str, Any] | None:
+    if scatter is None:
+        return None
+    if isinstance(scatter, Veil):
+        return {"fraction": scatter.fraction, "sigma_mm": scatter.sigma_mm}
+    return {"mean_of_run": float(scatter.mean())}
 
 
 def _write(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchkcreg.config import Config
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
-from torchkcreg.io import read_config, read_geometry, read_projections, read_spectrum
+from torchkcreg.io import read_config, read_geometry, read_projections, read_run, read_spectrum
 from torchkcreg.physics import Spectrum, material, tungsten_spectrum
 from torchkcreg.reconstruction import (
     BeamModel,
@@ -66,7 +66,8 @@ class ReconstructionOptions(Config):
         passes: Of the iterative methods; from the second on, mineral's hardening and the scatter in the metal's shadow
             are known from the pass before. None: two of "kcrec", which needs both, one of "pwls".
         window: Of the ramp.
-        scatter: "auto" fits a smooth one to the air around the object, "none", or its fraction of the primary.
+        scatter: "auto" fits a smooth one to the air around the object; "run" is what the registration found, of both
+            kinds; "none"; or its fraction of the primary.
         scatter_sigma_mm: How broad a given fraction's scatter is.
         monoenergetic: One energy, as in the paper, even where a spectrum is known.
         material: The implant's, where the registration had none.
@@ -85,7 +86,7 @@ class ReconstructionOptions(Config):
     beta: float = Field(10.0, ge=0)
     passes: int | None = Field(None, ge=1)
     window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = "hann"
-    scatter: Literal["auto", "none"] | float = "auto"
+    scatter: Literal["auto", "run", "none"] | float = "auto"
     scatter_sigma_mm: float = Field(40.0, gt=0)
     monoenergetic: bool = False
     material: str | None = None
@@ -110,7 +111,7 @@ class ReconstructionInputs:
         mask: 0 where a pixel holds no measurement.
         grid: The voxels.
         beam: Energies and the metals' attenuation.
-        scatter: Smooth scatter, None for none.
+        scatter: Smooth scatter, or an image of it in units of the open beam; None for none.
         spectrum: As detected; a likely one where no file says it.
         components: The metal in its place; none but for "kcrec".
     """
@@ -120,7 +121,7 @@ class ReconstructionInputs:
     mask: Tensor
     grid: VolumeGrid
     beam: BeamModel
-    scatter: Veil | None
+    scatter: Veil | Tensor | None
     spectrum: Spectrum
     components: list[KnownComponent]
 
@@ -148,16 +149,23 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         material(options.single_material)
         if options.method != "fdk":
             raise ValueError(f"a single material goes with method fdk, not {options.method}")
+    if options.scatter == "run" and files.run is None:
+        raise ValueError("scatter as a registration found it needs its run: name it with --run")
     if (note := projections.masked_note()) is not None:
         warnings.warn(f"projections file {files.projections}: {note}", stacklevel=2)
     transmission = torch.exp(-filled(projections.line_integrals, projections.mask))
+    scatter: Veil | Tensor | None
+    if options.scatter == "run" and files.run is not None:
+        scatter = read_run(files.run).scatter(transmission, geometry, mask=projections.mask)
+    else:
+        scatter = _scatter(transmission, projections.mask, geometry, options, saturated=projections.num_saturated > 0)
     return ReconstructionInputs(
         geometry,
         transmission,
         projections.mask,
         _grid(geometry, options),
         _beam(spectrum, options, components),
-        _scatter(transmission, projections.mask, geometry, options, saturated=projections.num_saturated > 0),
+        scatter,
         spectrum or tungsten_spectrum(),
         components,
     )

@@ -113,7 +113,7 @@ def _reconstructions(content: Mapping[str, Any], out: Path, quick: bool) -> str:
     for name, method in _METHODS.items():
         own = {key: value for key, value in more.items() if method != "fdk" or key == "spacing_mm"}
         folder = out / "reconstructions" / method
-        path = reconstructed(scan, CONFIGURATION, folder, run=run if method == "kcrec" else None, method=method, **own)
+        path = reconstructed(scan, CONFIGURATION, folder, run=run, method=method, scatter="run", **own)
         volumes[name], grid = read_volume(path)
         numbers[name] = read_json(folder / "metrics.json", "metrics")
         print(f"{name}: {numbers[name]['seconds']:.0f} s", flush=True)
