@@ -83,6 +83,13 @@ def test_what_was_made_is_kept_and_what_is_missing_is_made(case):
     assert (case / "still.npz").exists()
 
 
+def test_a_configuration_that_is_made_later_is_the_same(case):
+    before = (case / "bent.npz").read_bytes(), (case / "bent_implant.stl").read_bytes()
+    (case / "bent.npz").unlink()
+    simulate_files(case / "recipe.yaml", case, progress=False)
+    assert ((case / "bent.npz").read_bytes(), (case / "bent_implant.stl").read_bytes()) == before
+
+
 def test_a_folder_with_something_else_is_left_alone(case, tmp_path):
     other = written(tmp_path, screws={"holes": [0, 5]})
     with pytest.raises(FileExistsError, match="another recipe"):

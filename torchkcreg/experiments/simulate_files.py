@@ -94,17 +94,17 @@ def simulate_files(
     _write_specimen(out, whole, geometry, spectrum)
     truth = _truth_so_far(out, whole)
     have = {entry["name"] for entry in truth["cfg"]}
-    left = {name: load for name, load in asked.configurations.items() if name not in have}
+    left = asked.configurations.keys() - have
     if left:
-        rest = specimen_with(whole, asked.model_copy(update={"configurations": left}))
-        for taken in acquisitions(rest, geometry, spectrum, progress=progress):
+        nodes = _nodes(whole)
+        for taken in acquisitions(whole, geometry, spectrum, progress=progress, kept=have):
             write_projections(
                 out / f"{taken.name}.npz",
                 intensity=taken.counts,
                 open_beam=asked.panel.open_beam + asked.panel.offset,
             )
             write_mesh(out / f"{taken.name}_implant.stl", taken.loaded.mesh(whole.implant))
-            truth["cfg"].append(_truth_of(taken, whole))
+            truth["cfg"].append(_truth_of(taken, whole, nodes))
             truth["cfg"].sort(key=lambda entry: list(asked.configurations).index(entry["name"]))
             write_json(out / TRUTH, truth)
             if figures:
@@ -120,7 +120,7 @@ def read_specimen(recipe: Recipe) -> tuple[Specimen, ConeBeamGeometry, Spectrum]
         ValueError: If a file is malformed, or a material is not known.
         FileNotFoundError: If one is missing.
     """
-    files = recipe_files(recipe, Path())
+    files = recipe_files(recipe)
     meshes = {name: read_mesh(files[name]) for name in ("implant", "bone", "tissue") if name in files}
     screws = read_components(files["screws"]) if "screws" in files else None
     tube, panel = recipe.tube, recipe.panel
@@ -137,22 +137,18 @@ def read_specimen(recipe: Recipe) -> tuple[Specimen, ConeBeamGeometry, Spectrum]
     return made, geometry, spectrum
 
 
-def specimen_with(whole: Specimen, recipe: Recipe) -> Specimen:
-    """The same specimen with another recipe's loads."""
-    return Specimen(recipe, whole.implant, whole.holes, whole.screws, whole.bone, whole.tissue)
-
-
 def _take(out: Path, recipe: Recipe, overwrite: bool) -> None:
     kept = out / RECIPE
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(f"case folder {out} cannot be made: a file is in the way")
     record = plain(recipe.model_dump(mode="json"))
     if kept.exists():
-        if read_config(kept) == record:
+        before = read_config(kept)
+        if before == record:
             return
         if not overwrite:
             raise FileExistsError(f"folder {out} holds a case of another recipe: replace it with --overwrite")
-        for name in read_config(kept).get("configurations") or {}:
+        for name in before.get("configurations") or {}:
             for ending in (".npz", ".png", "_implant.stl"):
                 (out / f"{name}{ending}").unlink(missing_ok=True)
         (out / TRUTH).unlink(missing_ok=True)
@@ -182,18 +178,11 @@ def _write_specimen(out: Path, whole: Specimen, geometry: ConeBeamGeometry, spec
 def _background(whole: Specimen) -> list[dict[str, Any]]:
     limb = whole.recipe.limb
     rods = [
-        {
-            "a": list(rod.start),
-            "b": list(rod.end),
-            "r": rod.radius,
-            "material": rod.material or f"ca{rod.calcium_mg_ml:g}",
-        }
-        for rod in limb.inserts
+        {"a": list(rod.start), "b": list(rod.end), "r": rod.radius, "material": rod.substance} for rod in limb.inserts
     ]
     if limb.tissue is None or limb.tissue.radius is None:
         return rods
-    bone = limb.bone
-    x, y, z = limb.tissue.axis or ((0.0, 0.0, 0.0) if bone is None else bone.axis)
+    x, y, z = limb.axis
     half = limb.tissue.half_length
     around = {"a": [x, y, z - half], "b": [x, y, z + half], "r": limb.tissue.radius, "material": limb.tissue.material}
     return [around, *({**rod, "displaces": limb.tissue.material} for rod in rods)]
@@ -208,15 +197,11 @@ def _truth_so_far(out: Path, whole: Specimen) -> dict[str, Any]:
     return {"units": "mm", "bb_reference_mm": _listed(whole.beads()), "cfg": []}
 
 
-def _truth_of(taken: Acquisition, whole: Specimen) -> dict[str, Any]:
-    nodes, state = _nodes(whole), taken.loaded
-    beads = [
-        state.fragments[whole.fragment_of(float(center[2]))] @ torch.cat([center, center.new_ones(1)])
-        for center in whole.beads()
-    ]
+def _truth_of(taken: Acquisition, whole: Specimen, nodes: Tensor) -> dict[str, Any]:
+    state = taken.loaded
     found = {
         "name": taken.name,
-        "bb_mm": [bead[:3].tolist() for bead in beads],
+        "bb_mm": whole.beads_after(state.fragments).tolist(),
         "nodes_undeformed_mm": _listed(nodes),
         "nodes_deformed_mm": _listed(state.implant(nodes)),
         "fragments": {name: motion.tolist() for name, motion in state.fragments.items()},

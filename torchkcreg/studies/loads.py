@@ -10,7 +10,7 @@ import numpy as np
 from torchkcreg.evaluation import bb_rmse
 from torchkcreg.experiments.paper import packaged
 from torchkcreg.geometry import MultisourceScanner
-from torchkcreg.implant import Component, ImplantPointCloud, find_holes
+from torchkcreg.implant import Component, ImplantPointCloud
 from torchkcreg.physics import line_integrals_from_intensity, tungsten_spectrum
 from torchkcreg.registration import RegistrationConfig, RegistrationData, register
 from torchkcreg.simulation.bench import ElasticConstruct, Recipe, acquisitions, specimen, views_of
@@ -58,18 +58,13 @@ def registered_load(job: Job) -> Row:
         config,
         spectrum=spectrum if job["known"] else None,
         components=[Component.of(screw) for screw in made.screws] if job["known"] else (),
-        holes=find_holes(made.implant),
+        holes=made.holes,
     )
     nodes = cloud.coarsened(_NODES_COARSER).points.double()
-    fragments = taken.loaded.fragments
-    placed = [fragments[made.fragment_of(float(bead[2]))] for bead in made.beads()]
-    beads = [motion[:3, :3] @ bead + motion[:3, 3] for motion, bead in zip(placed, made.beads(), strict=True)]
     return {
         **{name: job[name] for name in ("seed", "load_n", "views", "photons")},
         "nodes": round(float(bb_rmse(result.warp(nodes), taken.loaded.implant(nodes))), 4),
-        "beads": round(
-            float(bb_rmse(result.warp(made.beads()), made.beads().new_tensor([b.tolist() for b in beads]))), 4
-        ),
+        "beads": round(float(bb_rmse(result.warp(made.beads()), made.beads_after(taken.loaded.fragments))), 4),
         "node_std_mm": result.diagnostics.get("node_std_mm"),
         "status": result.status,
         "seconds": round(time.perf_counter() - start, 1),

@@ -13,6 +13,7 @@ from torchkcreg.evaluation import ShapeEvaluation, bb_rmse, cylinder_region, dis
 from torchkcreg.experiments.evaluate_files import evaluate_files
 from torchkcreg.experiments.paper.steps import (
     PAPER_SETTINGS,
+    ViewSets,
     packaged,
     reconstructed,
     registered,
@@ -21,9 +22,10 @@ from torchkcreg.experiments.paper.steps import (
     start_of,
 )
 from torchkcreg.experiments.registered_components import registered_components
-from torchkcreg.geometry import MultisourceScanner, VolumeGrid
+from torchkcreg.geometry import VolumeGrid
 from torchkcreg.io import read_json, read_volume, write_figure, write_json, write_text
 from torchkcreg.physics import material
+from torchkcreg.simulation.bench import Recipe
 from torchkcreg.visualization import reconstruction_figure
 
 CONFIGURATION = "deformed"
@@ -51,18 +53,18 @@ def femoral_plate(out: Path, *, quick: bool = False, known: bool = True, paper: 
     Raises:
         FileExistsError: If the folder holds another experiment.
     """
-    out, content, scanner = Path(out), packaged("femoral_plate"), MultisourceScanner()
-    sets = {int(n): scanner.paper_views(n) for n in (("3",) if quick else ("3", "12"))}
-    used = sorted({view for views in sets.values() for view in views})
-    case = simulated(content, out / "views", scanner={"views": used, "binning": 2 if quick else 1, "cols": 384})
+    out, content, sets = Path(out), packaged("femoral_plate"), ViewSets.of_paper(quick=quick)
+    imaged = {"views": sets.imaged, "binning": 2 if quick else 1, "cols": 384}
+    case = simulated(content, out / "views", scanner=imaged)
     start, options = start_of(out), {"material": content["implant"]["material"]}
-    jobs = [(number, False) for number in sorted(sets)] + ([(3, True)] if paper else [])
+    jobs = [(number, False) for number in sorted(sets.views)] + ([(3, True)] if paper else [])
     rows = []
     for number, own in jobs:
         run = out / "runs" / f"{CONFIGURATION}-{number}{'-paper' if own else ''}"
-        places = [used.index(view) for view in sets[number]]
         chosen = PAPER_SETTINGS if own else options
-        result = registered(case, CONFIGURATION, places, run, start=start, options=chosen, known=known and not own)
+        result = registered(
+            case, CONFIGURATION, sets.places(number), run, start=start, options=chosen, known=known and not own
+        )
         figures = out / f"evaluation-{run.name}"
         shape = evaluate_files(run, reference=case / f"{CONFIGURATION}_implant.stl", figures=figures).shape
         assert shape is not None  # there is a reference
@@ -134,8 +136,6 @@ def _regions(
     from_metal: torch.Tensor,
 ) -> str:
     """Means and deviations of water and rods, HU against water, each against what its material has."""
-    from torchkcreg.simulation.bench import Recipe
-
     limb, height = Recipe.of(content).limb, grid.points(dtype=torch.float64)[..., 2].abs() <= _WITHIN_MM
     assert limb.tissue is not None and limb.tissue.axis is not None and limb.tissue.radius is not None  # its recipe
     clear, near = from_metal > 2 * max(grid.spacing), from_metal <= max(_NEAR_MM, 3 * max(grid.spacing))
@@ -144,7 +144,7 @@ def _regions(
     regions: dict[str, tuple[torch.Tensor, str]] = {}
     for rod in limb.inserts:
         region = cylinder_region(grid, rod.start, rod.end, _INSIDE * rod.radius)
-        regions[f"{rod.calcium_mg_ml:g} mg/mL"] = (region & height & clear, f"ca{rod.calcium_mg_ml:g}")
+        regions[f"{rod.calcium_mg_ml:g} mg/mL"] = (region & height & clear, rod.substance)
         bath &= ~cylinder_region(grid, rod.start, rod.end, 1.3 * rod.radius)
     regions = {
         "water": (bath & height & clear, "water"),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from torchkcreg.experiments.inputs import RegistrationFiles
@@ -14,13 +16,39 @@ from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_
 from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles
 from torchkcreg.experiments.register_files import register_files
 from torchkcreg.experiments.simulate_files import simulate_files
-from torchkcreg.geometry import rigid_matrix
+from torchkcreg.geometry import MultisourceScanner, rigid_matrix
 from torchkcreg.io import read_json, read_run, write_init
 from torchkcreg.registration import RegistrationResult
 from torchkcreg.simulation.bench import Recipe
 
 PAPER_SETTINGS = {"preset": "paper", "deformation": "ffd", "find_screws": False, "view_motion": "off"}
 _START_DEG, _START_MM = (0.8, -0.6, 1.0), (1.0, -1.2, 0.8)  # by which a registration's start is off
+
+
+@dataclass(frozen=True)
+class ViewSets:
+    """The paper's sets of views, of which only these are imaged.
+
+    Attributes:
+        views: Numbers of the scan's views, by how many they are.
+    """
+
+    views: dict[int, list[int]]
+
+    @classmethod
+    def of_paper(cls, *, quick: bool) -> ViewSets:
+        """Three views and twelve; the three alone where it is to be quick."""
+        scanner = MultisourceScanner()
+        return cls({int(n): scanner.paper_views(n) for n in (("3",) if quick else ("3", "12"))})
+
+    @property
+    def imaged(self) -> list[int]:
+        """All of them, in the scan's order."""
+        return sorted({view for views in self.views.values() for view in views})
+
+    def places(self, number: int) -> list[int]:
+        """Places of the views of a set among those that are imaged."""
+        return [self.imaged.index(view) for view in self.views[number]]
 
 
 def packaged(name: str) -> dict[str, Any]:
@@ -38,8 +66,6 @@ def simulated(content: Mapping[str, Any], folder: Path, **changes: Any) -> Path:
 
 def start_of(folder: Path) -> Path:
     """A file with a start pose that is off by one and a half millimetres and degrees."""
-    import torch
-
     folder.mkdir(parents=True, exist_ok=True)
     turn = torch.deg2rad(torch.tensor(_START_DEG, dtype=torch.float64, device="cpu"))
     pose = rigid_matrix(turn, torch.tensor(_START_MM, dtype=torch.float64, device="cpu"))
@@ -57,7 +83,6 @@ def registered(
     options: Mapping[str, Any],
     known: bool = True,
     implant: Path | None = None,
-    figures: bool = True,
 ) -> RegistrationResult:
     """The registration of a configuration, in its run folder; one that was broken off goes on.
 
@@ -70,7 +95,6 @@ def registered(
         options: Of the registration.
         known: Screws and spectrum are told.
         implant: Another model of the undeformed implant than the case's.
-        figures: Draw the run.
     """
     if (run / "deformation.json").exists():
         return read_run(run)
@@ -83,7 +107,7 @@ def registered(
         init=start,
         views=views,
     )
-    return register_files(files, run, overrides=dict(options), resume=run.exists(), figures=figures)
+    return register_files(files, run, overrides=dict(options), resume=run.exists())
 
 
 def seconds_of(folder: Path) -> float:

@@ -16,6 +16,7 @@ from torchkcreg.evaluation import bb_rmse, find_beads
 from torchkcreg.experiments.paper.series import draw_series
 from torchkcreg.experiments.paper.steps import (
     PAPER_SETTINGS,
+    ViewSets,
     bench_model,
     packaged,
     reconstructed,
@@ -24,9 +25,10 @@ from torchkcreg.experiments.paper.steps import (
     simulated,
     start_of,
 )
-from torchkcreg.geometry import MultisourceScanner, transform_points
+from torchkcreg.geometry import transform_points
 from torchkcreg.io import read_init, read_json, read_volume, write_json, write_text
 from torchkcreg.registration import RegistrationResult
+from torchkcreg.simulation.bench import LoadRecipe
 
 CAD, BENCH, PAPER = "CAD", "bench scan", "paper's settings"
 _QUICK_LOADS = ("cfg0", "cfg3")
@@ -87,7 +89,7 @@ def tibial_plate(out: Path, *, quick: bool = False, known: bool = True, paper: b
         rows.append(study.row(configuration, number, model))
         print(_in_words(rows[-1]), flush=True)
         write_json(study.out / "rows.json", [asdict(row) for row in rows])
-    draw_series(study.out, study.case, study.drawn, study.places[3][1])
+    draw_series(study.out, study.case, study.drawn, study.sets.places(3)[1])
     table = load_table(rows)
     write_text(study.out / "table.md", table + "\n")
     return table
@@ -110,22 +112,19 @@ class _Study:
         return content
 
     @cached_property
-    def sets(self) -> dict[int, list[int]]:
-        """The scan's views that are registered, by their number."""
-        scanner = MultisourceScanner()
-        return {int(n): scanner.paper_views(n) for n in (("3",) if self.quick else ("3", "12"))}
+    def sets(self) -> ViewSets:
+        """The views that are registered."""
+        return ViewSets.of_paper(quick=self.quick)
 
     @cached_property
-    def places(self) -> dict[int, list[int]]:
-        """Places of these among the views that are imaged."""
-        used = sorted({view for views in self.sets.values() for view in views})
-        return {number: [used.index(view) for view in views] for number, views in self.sets.items()}
+    def start(self) -> Path:
+        """File of the start pose."""
+        return start_of(self.out)
 
     @cached_property
     def case(self) -> Path:
         """Images of the views that are registered."""
-        used = sorted({view for views in self.sets.values() for view in views})
-        scanner = {"views": used, "binning": 2 if self.quick else 1}
+        scanner = {"views": self.sets.imaged, "binning": 2 if self.quick else 1}
         return simulated(self.content, self.out / "views", scanner=scanner)
 
     @cached_property
@@ -152,7 +151,7 @@ class _Study:
         """Configuration, number of views and model of each registration."""
         names = list(self.content["configurations"])
         for name in names:
-            yield from ((name, number, CAD) for number in sorted(self.sets))
+            yield from ((name, number, CAD) for number in sorted(self.sets.views))
             if name == names[-1] and not self.quick:
                 yield name, 3, BENCH
             if paper:
@@ -162,13 +161,13 @@ class _Study:
         """What a registration finds."""
         own = model == PAPER
         name = f"{configuration}-{number}" + {CAD: "", BENCH: "-bench", PAPER: "-paper"}[model]
-        run, start = self.out / "runs" / name, start_of(self.out)
+        run = self.out / "runs" / name
         result = registered(
             self.case,
             configuration,
-            self.places[number],
+            self.sets.places(number),
             run,
-            start=start,
+            start=self.start,
             options=PAPER_SETTINGS if own else {"material": self.content["implant"]["material"]},
             known=self.known and not own,
             implant=self.bench if model == BENCH else None,
@@ -177,7 +176,7 @@ class _Study:
             self.drawn[configuration] = result
         truth = self.truth[configuration]
         before, after = _points(truth["nodes_undeformed_mm"]), _points(truth["nodes_deformed_mm"])
-        placed = transform_points(read_init(start), self.beads)
+        placed = transform_points(read_init(self.start), self.beads)
         return LoadRow(
             configuration,
             _newton(self.content["configurations"][configuration]),
@@ -239,8 +238,6 @@ def _in_words(row: LoadRow) -> str:
 
 
 def _newton(load: Mapping[str, Any]) -> float:
-    from torchkcreg.simulation.bench import LoadRecipe
-
     return abs(LoadRecipe.of(load).force[2])
 
 

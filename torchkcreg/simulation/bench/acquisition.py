@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -46,6 +46,7 @@ def acquisitions(
     *,
     progress: bool = True,
     construct: ElasticConstruct | None = None,
+    kept: Collection[str] = (),
 ) -> Iterator[Acquisition]:
     """Each configuration of a specimen's recipe in turn, imaged.
 
@@ -55,15 +56,17 @@ def acquisitions(
         spectrum: As detected.
         progress: Show it.
         construct: Of the specimen, where it has been made already: making it takes seconds.
+        kept: Names of configurations that are left out; the others are what they are with them.
 
     Raises:
         ValueError: If the parts do not fit into each other, or a load is impossible.
     """
     recipe = specimen.recipe
-    if construct is None and any(any(load.force) for load in recipe.configurations.values()):
+    asked = [(i, name, load) for i, (name, load) in enumerate(recipe.configurations.items()) if name not in kept]
+    if construct is None and any(any(load.force) for _, _, load in asked):
         construct = ElasticConstruct(specimen)
     panel, spacing = panel_of(recipe), geometry.pixel_spacing
-    for number, (name, load) in enumerate(recipe.configurations.items()):
+    for number, name, load in asked:
         state = loaded(specimen, load, construct)
         parts = parts_in_beam(specimen, state)
         primaries = _primaries(geometry, parts, spectrum, recipe.panel.supersample, name if progress else None)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -83,17 +84,20 @@ class FlatPanel:
         """Counts (rows, cols), uint16, of a signal in units of the open beam."""
         if math.isfinite(self.photons):
             signal = torch.poisson(signal * self.photons, generator=generator) / self.photons
-        gain, dead = self._faults(signal)
+        gain, dead = _faults(self, tuple(signal.shape))
         counts = self.detected(signal, pixel_spacing) * gain * self.open_beam + self.offset
         noise = torch.randn(counts.shape, dtype=counts.dtype, generator=generator, device="cpu")
         counts = (counts + self.electronic_noise * noise).round().clamp(0, self.saturation)
         return counts.masked_fill(dead, 0).to(torch.int32).to(torch.uint16)
 
-    def _faults(self, signal: Tensor) -> tuple[Tensor, Tensor]:
-        own = torch.Generator(device="cpu").manual_seed(self.seed)
-        normal = torch.randn(signal.shape, dtype=signal.dtype, generator=own, device="cpu")
-        even = torch.rand(signal.shape, dtype=signal.dtype, generator=own, device="cpu")
-        return 1 + self.gain_error * normal, even < self.dead_pixels
+
+@lru_cache(maxsize=1)
+def _faults(panel: FlatPanel, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Gains of pixels and which of them are dead, (rows, cols): the same in every view."""
+    own = torch.Generator(device="cpu").manual_seed(panel.seed)
+    normal = torch.randn(shape, dtype=torch.float64, generator=own, device="cpu")
+    even = torch.rand(shape, dtype=torch.float64, generator=own, device="cpu")
+    return 1 + panel.gain_error * normal, even < panel.dead_pixels
 
 
 def scatter_shapes(primaries: Tensor, pixel_spacing: Sequence[float]) -> Tensor:

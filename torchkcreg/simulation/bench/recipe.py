@@ -143,6 +143,11 @@ class InsertRecipe(Config):
             raise ValueError("an insert has either calcium_mg_ml or a material")
         return self
 
+    @property
+    def substance(self) -> str:
+        """Name of its material."""
+        return self.material or f"ca{self.calcium_mg_ml:g}"
+
 
 class LimbRecipe(Config):
     """What stands in the beam besides the implant and its screws.
@@ -159,6 +164,12 @@ class LimbRecipe(Config):
     inserts: tuple[InsertRecipe, ...] = ()
     beads: tuple[Place, ...] = ()
     bead_radius: Length = 1.0
+
+    @property
+    def axis(self) -> tuple[float, float, float]:
+        """A point on the axis of cylindrical tissue, mm: its own, or the bone's."""
+        own = None if self.tissue is None else self.tissue.axis
+        return own or ((0.0, 0.0, 0.0) if self.bone is None else self.bone.axis)
 
 
 class LoadRecipe(Config):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from torchkcreg.geometry import transform_points
 from torchkcreg.implant import Hole, Screw, find_holes
 from torchkcreg.simulation.bench.recipe import HeadRecipe, PlateShape, Recipe
 from torchkcreg.simulation.hardware import locking_plate
@@ -51,6 +53,12 @@ class Specimen:
     def beads(self) -> Tensor:
         """Their centres (B, 3), mm."""
         return torch.tensor(self.recipe.limb.beads, dtype=torch.float64, device="cpu").reshape(-1, 3)
+
+    def beads_after(self, fragments: Mapping[str, Tensor]) -> Tensor:
+        """Where rigid motions (4, 4) of the fragments take them, (B, 3), mm."""
+        beads = self.beads()
+        moved = [transform_points(fragments[self.fragment_of(float(bead[2]))], bead[None]) for bead in beads]
+        return torch.cat([beads[:0], *moved])
 
     @property
     def head(self) -> HeadRecipe | None:
@@ -149,8 +157,8 @@ def _tilted(axis: np.ndarray, most: float, rng: np.random.Generator) -> np.ndarr
     return math.cos(angle) * axis + math.sin(angle) * aside / np.linalg.norm(aside)
 
 
-def recipe_files(recipe: Recipe, folder: Path) -> dict[str, Path]:
-    """Files that a recipe names, by what they are; those in the recipe are relative to the folder of its own."""
+def recipe_files(recipe: Recipe) -> dict[str, Path]:
+    """Files that a recipe names, by what they are."""
     limb, tissue = recipe.limb, recipe.limb.tissue
     named = {
         "implant": recipe.implant.mesh,
@@ -160,7 +168,7 @@ def recipe_files(recipe: Recipe, folder: Path) -> dict[str, Path]:
         "spectrum": recipe.tube.spectrum,
         "geometry": recipe.scanner.geometry,
     }
-    return {what: folder / path for what, path in named.items() if path is not None}
+    return {what: path for what, path in named.items() if path is not None}
 
 
 def recipe_in(recipe: Recipe, folder: Path) -> Recipe:

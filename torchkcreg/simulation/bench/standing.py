@@ -40,16 +40,16 @@ def parts_in_beam(specimen: Specimen, state: Loaded) -> list[Part]:
             cap = Cylinder(shaft.start, shaft.start + specimen.head.height * up, specimen.head.radius).moved(motion)
             parts.append(_placed(f"head{number}", cap, screw.material, around))
     parts += _bones(specimen, state, shafts, around)
-    for number, center in enumerate(specimen.beads()):
-        bead = Sphere(center, limb.bead_radius).moved(state.fragments[specimen.fragment_of(float(center[2]))])
-        parts.append(_placed(f"bead{number}", bead, "steel", around))
+    for number, center in enumerate(specimen.beads_after(state.fragments)):
+        parts.append(_placed(f"bead{number}", Sphere(center, limb.bead_radius), "steel", around))
     bones = [part for part in parts if isinstance(part.shape, Tube)]
     for number, rod in enumerate(limb.inserts):
         for bone in bones:
             _check_apart(f"insert{number}", (_tensor(rod.start), _tensor(rod.end)), rod.radius, bone)
-        name = rod.material or f"ca{rod.calcium_mg_ml:g}"
         parts.append(
-            _placed(f"insert{number}", Cylinder(_tensor(rod.start), _tensor(rod.end), rod.radius), name, around)
+            _placed(
+                f"insert{number}", Cylinder(_tensor(rod.start), _tensor(rod.end), rod.radius), rod.substance, around
+            )
         )
     return parts if tissue is None else [*parts, tissue]
 
@@ -110,12 +110,12 @@ def _drilled(bone: trimesh.Trimesh, shafts: list[Cylinder]) -> trimesh.Trimesh:
 
 
 def _tissue(specimen: Specimen) -> Part | None:
-    asked, bone = specimen.recipe.limb.tissue, specimen.recipe.limb.bone
+    asked = specimen.recipe.limb.tissue
     if asked is None:
         return None
     if specimen.tissue is not None:
         return Part(_TISSUE, specimen.tissue, asked.material)
-    middle = asked.axis or (bone.axis if bone is not None else (0.0, 0.0, 0.0))
+    middle = specimen.recipe.limb.axis
     low, high = (_tensor((middle[0], middle[1], middle[2] + side * asked.half_length)) for side in (-1.0, 1.0))
     assert asked.radius is not None  # it has no mesh
     return Part(_TISSUE, Cylinder(low, high, asked.radius), asked.material)
