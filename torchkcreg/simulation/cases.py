@@ -14,7 +14,7 @@ from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid
 from torchkcreg.implant import Screw
 from torchkcreg.mechanics import CarriedLoad
 from torchkcreg.physics import Spectrum, tungsten_spectrum
-from torchkcreg.simulation.hardware import hole_positions, locking_plate, locking_screws
+from torchkcreg.simulation.hardware import hole_positions, locking_plate, locking_screws, mapped
 from torchkcreg.simulation.loads import Load
 from torchkcreg.simulation.parts import Part
 from torchkcreg.simulation.scanner import DetectorModel, simulate_projections
@@ -67,7 +67,7 @@ class SimulatedCase:
 
     def deformed_implant(self) -> trimesh.Trimesh:
         """Mesh of the plate under load: the truth."""
-        return _mapped(self.implant, self.deform)
+        return mapped(self.implant, self.deform)
 
 
 def weight_bearing_case(
@@ -169,7 +169,7 @@ def _parts_in_beam(
 ) -> list[Part]:
     """The loaded plate, its screws, the bone's fragments, beads and soft tissue."""
     tissue = None if tissue_radius_mm is None else "tissue"
-    parts = [Part("plate", _mapped(plate, deform), "steel", inside=tissue)]
+    parts = [Part("plate", mapped(plate, deform), "steel", inside=tissue)]
     for number, screw in enumerate(screws):
         head, tip = deform(torch.tensor([screw.start, screw.end], dtype=torch.float64))
         cylinder = Cylinder(head, tip, screw.radius)
@@ -207,9 +207,3 @@ def _cropped(det_shape: tuple[int, int], binning: int) -> ConeBeamGeometry:
     rows, cols = (slice(start, start + size) for start, size in zip(first, det_shape))
     geometry = scanner.geometry().crop(rows, cols)
     return geometry if binning == 1 else geometry.bin(binning)
-
-
-def _mapped(mesh: trimesh.Trimesh, mapping: Callable[[Tensor], Tensor]) -> trimesh.Trimesh:
-    """The mesh with every vertex moved."""
-    vertices = mapping(torch.tensor(np.asarray(mesh.vertices), dtype=torch.float64))
-    return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)

@@ -107,9 +107,9 @@ def _amounts(fragments: Fragments, rest: RodMotion, element: Superelement, rng: 
     shift = torch.tensor(fragments.shift, dtype=torch.float64)
     wanted = torch.cat([torch.linalg.cross(turn, centers[used]) + shift, turn], dim=1) * above[:, None]
     springs = rng.lognormal(0.0, 0.5, size=(len(used), 1)) * np.array([_SCREW_SHEAR] * 3 + [_SCREW_TURN] * 3)
-    moved = _hold_motions(element, used)  # (A, U, 6)
+    moved = hold_motions(element, used)  # (A, U, 6)
     loads = element.loads
-    rigid = torch.stack([_rigid(centers[hold]) for hold in used])  # (U, 6, 6)
+    rigid = torch.stack([rigid_at(centers[hold]) for hold in used])  # (U, 6, 6)
     free = [hold for hold in range(len(centers)) if hold not in used]
     number = len(loads)
     yielding = moved + loads[:, used] / torch.from_numpy(springs)
@@ -121,7 +121,7 @@ def _amounts(fragments: Fragments, rest: RodMotion, element: Superelement, rng: 
     return torch.linalg.lstsq(torch.cat(rows), right[:, None], driver="gelsd").solution[:number, 0]
 
 
-def _hold_motions(element: Superelement, holds: list[int]) -> Tensor:
+def hold_motions(element: Superelement, holds: list[int]) -> Tensor:
     """Shift and small turn (A, U, 6) of holds at an amount of one."""
     positions = transform_points(element.hexahedra.frame, element.hexahedra.positions)
     found = []
@@ -134,7 +134,7 @@ def _hold_motions(element: Superelement, holds: list[int]) -> Tensor:
     return torch.stack(found, dim=1)
 
 
-def _rigid(center: Tensor) -> Tensor:
+def rigid_at(center: Tensor) -> Tensor:
     """Shift and turn (6, 6) at a place of the six rigid motions about the origin."""
     same = torch.eye(3, dtype=center.dtype)
     turning = torch.linalg.cross(same, center.expand(3, 3)).T

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+import torch
 import trimesh
+from torch import Tensor
 
 from torchkcreg.implant import Screw
 from torchkcreg.simulation.outline import plate_outline
@@ -79,6 +81,19 @@ def locking_screws(
         Screw((0.0, head_y, float(z)), (0.0, tip_y, float(z)), radius, material, f"screw{number}")
         for number, z in enumerate(positions)
     ]
+
+
+def flared(plate: trimesh.Trimesh, length: float, flare: float) -> trimesh.Trimesh:
+    """A straight plate, itself, whose upper end is so many times as wide as its shaft."""
+    share = ((plate.vertices[:, 2] / length - 0.05) / 0.35).clip(0, 1)
+    plate.vertices[:, 0] *= 1 + (flare - 1) * share**2 * (3 - 2 * share)
+    return plate
+
+
+def mapped(mesh: trimesh.Trimesh, mapping: Callable[[Tensor], Tensor]) -> trimesh.Trimesh:
+    """The mesh with every vertex moved, in float64."""
+    vertices = mapping(torch.tensor(np.asarray(mesh.vertices), dtype=torch.float64, device="cpu"))
+    return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)
 
 
 def _extruded(points: np.ndarray, triangles: np.ndarray, thickness: float, layers: int) -> trimesh.Trimesh:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -18,7 +17,7 @@ from torchkcreg.physics import tungsten_spectrum
 from torchkcreg.simulation.cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase, fragment_at
 from torchkcreg.simulation.draws import Draw, draw_case
 from torchkcreg.simulation.elastic import ElasticMotion, Fragments, elastic_motion
-from torchkcreg.simulation.hardware import locking_plate
+from torchkcreg.simulation.hardware import flared, locking_plate, mapped
 from torchkcreg.simulation.loads import Load, RodMotion
 from torchkcreg.simulation.parts import Part
 from torchkcreg.simulation.scanner import simulate_projections
@@ -48,14 +47,14 @@ def random_case(
     if elastic:
         rng = np.random.default_rng([draw.seed, 22])
         pose = _misalignment(draw)
-        loaded, carried = elastic_motion(rest, _mapped(straight, rest), draw.material, _fragments(draw), pose, rng)
+        loaded, carried = elastic_motion(rest, mapped(straight, rest), draw.material, _fragments(draw), pose, rng)
 
     def deform(points: Tensor) -> Tensor:
         return loaded(rest.straightened(points)).to(points.dtype)
 
     listed, in_beam = _screws(draw, rest, loaded)
     beads = _bead_positions(draw)
-    parts = [Part("plate", _mapped(straight, loaded), draw.material, inside=_tissue(draw)), *in_beam]
+    parts = [Part("plate", mapped(straight, loaded), draw.material, inside=_tissue(draw)), *in_beam]
     parts += _limb(draw, loaded)
     parts += [
         Part(f"bead{n}", Sphere(center, BEAD_RADIUS), "steel", inside=_tissue(draw))
@@ -67,7 +66,7 @@ def random_case(
         counts = simulate_projections(geometry, parts, spectrum, detector=draw.detector, seed=draw.seed)
     return SimulatedCase(
         geometry=geometry,
-        implant=_mapped(straight, rest),
+        implant=mapped(straight, rest),
         implant_material=draw.material,
         screws=listed,
         beads_before=rest(beads),
@@ -159,9 +158,7 @@ def _straight_plate(draw: Draw) -> trimesh.Trimesh:
         hole_offset=draw.hole_offset,
         max_edge=2.0,
     )
-    share = ((plate.vertices[:, 2] / draw.length - 0.05) / 0.35).clip(0, 1)
-    plate.vertices[:, 0] *= 1 + (draw.flare - 1) * share**2 * (3 - 2 * share)
-    return plate
+    return flared(plate, draw.length, draw.flare)
 
 
 def _screws(draw: Draw, rest: RodMotion, loaded: PlateMotion) -> tuple[list[Screw], list[Part]]:
@@ -229,9 +226,3 @@ def _bead_positions(draw: Draw) -> Tensor:
     below = group * torch.tensor([1.0, 1.0, -1.0]) + torch.tensor([0.0, 0.0, low + 4.0])
     above = group * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([0.0, 0.0, high - 4.0])
     return torch.cat([below, above])
-
-
-def _mapped(mesh: trimesh.Trimesh, mapping: Callable[[Tensor], Tensor]) -> trimesh.Trimesh:
-    """The mesh with every vertex moved."""
-    vertices = mapping(torch.tensor(np.asarray(mesh.vertices), dtype=torch.float64))
-    return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)

@@ -14,11 +14,12 @@ from torch import Tensor
 from torchkcreg.deformation import FiniteElementDeformation
 from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics import CarriedLoad, Hold, Superelement, holds_of, von_mises
-from torchkcreg.mechanics.rigid import rigid_fields
+from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
 from torchkcreg.physics import elastic_constants
 from torchkcreg.simulation.bench.recipe import LoadRecipe
 from torchkcreg.simulation.bench.specimen import DISTAL, PROXIMAL, Specimen
+from torchkcreg.simulation.elastic import hold_motions, rigid_at
+from torchkcreg.simulation.hardware import mapped
 from torchkcreg.simulation.loads import Load
 
 _PITCH_MM = 0.4  # of the finite elements' nodes, or less: a tenth of the implant's thickness
@@ -45,8 +46,7 @@ class Loaded:
 
     def mesh(self, undeformed: trimesh.Trimesh) -> trimesh.Trimesh:
         """The implant's mesh under load."""
-        moved = self.implant(torch.from_numpy(np.array(undeformed.vertices)))
-        return trimesh.Trimesh(moved.numpy(), undeformed.faces, process=False)
+        return mapped(undeformed, self.implant)
 
 
 class ElasticConstruct:
@@ -88,17 +88,18 @@ class ElasticConstruct:
         """
         element, number = self.element, self.element.num_amounts
         loads, used = element.loads, sorted(self.sides)
-        held = torch.cat([_motion_of(element, hold) for hold in used], dim=1)  # (A, 6 U)
+        alike = loads.new_tensor([1.0] * 3 + [_TURN_MM] * 3)
+        held = (hold_motions(element, used) * alike).flatten(1)  # (A, 6 U)
         rigid = held.new_zeros(6 * len(used), 12)
         for row, hold in enumerate(used):
             first = 6 if self.sides[hold] == PROXIMAL else 0
-            rigid[6 * row : 6 * row + 6, first : first + 6] = -_rigid_at(self.places[hold])
+            rigid[6 * row : 6 * row + 6, first : first + 6] = -alike[:, None] * rigid_at(self.places[hold])
         proximal = [hold for hold in used if self.sides[hold] == PROXIMAL]
         arms = (self.places[proximal] - at).expand(number, -1, 3)
         moments = loads[:, proximal, 3:] + torch.linalg.cross(arms, loads[:, proximal, :3])
         wrench = torch.cat([loads[:, proximal, :3].sum(1), moments.sum(1) / _TURN_MM], dim=1)  # (A, 6)
         free = [hold for hold in range(len(self.places)) if hold not in self.sides]
-        idle = loads[:, free] / loads.new_tensor([1.0] * 3 + [_TURN_MM] * 3)
+        idle = loads[:, free] / alike
         compliance = float(held.abs().max() / loads.abs().max())  # mm/N: so that rows weigh alike
         known = torch.cat([wrench, idle.flatten(1)], dim=1).T * compliance
         rows = torch.cat([torch.cat([held.T, rigid], dim=1), torch.cat([known, known.new_zeros(len(known), 12)], 1)])
@@ -205,21 +206,3 @@ def _of_motion(specimen: Specimen, motion: Callable[[Tensor], Tensor]) -> Loaded
 
 def _hold_nodes(element: Superelement, hold: int) -> Tensor:
     return element.holds[hold].nodes(transform_points(element.hexahedra.frame, element.hexahedra.positions))
-
-
-def _motion_of(element: Superelement, number: int) -> Tensor:
-    """Shift and small turn times a length (A, 6), mm, of a hold at an amount of one of each."""
-    hold: Hold = element.holds[number]
-    near = _hold_nodes(element, number)
-    positions = transform_points(element.hexahedra.frame, element.hexahedra.positions)[near]
-    fields = rigid_fields(positions - positions.new_tensor(hold.center))
-    moved = element.nodal[:, near].flatten(1).T.to(fields)
-    found = torch.linalg.lstsq(fields.flatten(1).T, moved).solution.T
-    return found * found.new_tensor([1.0] * 3 + [_TURN_MM] * 3)
-
-
-def _rigid_at(center: Tensor) -> Tensor:
-    """Shift and small turn times a length (6, 6) at a place of the six rigid motions about the origin."""
-    same = torch.eye(3, dtype=center.dtype, device=center.device)
-    turning = torch.linalg.cross(same, center.expand(3, 3)).T
-    return torch.cat([torch.cat([same, turning], dim=1), torch.cat([torch.zeros_like(same), _TURN_MM * same], dim=1)])

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import Hole, Screw, find_holes
 from torchkcreg.simulation.bench.recipe import HeadRecipe, PlateShape, Recipe
-from torchkcreg.simulation.hardware import locking_plate
+from torchkcreg.simulation.hardware import flared, locking_plate, mapped
 from torchkcreg.simulation.loads import RodMotion
 
 DISTAL, PROXIMAL = "distal", "proximal"
@@ -80,16 +80,12 @@ def parametric_plate(shape: PlateShape) -> trimesh.Trimesh:
         hole_radius=shape.hole_radius,
         hole_offset=shape.hole_offset,
     )
-    if shape.flare != 1:
-        share = ((plate.vertices[:, 2] / shape.length - 0.05) / 0.35).clip(0, 1)
-        plate.vertices[:, 0] *= 1 + (shape.flare - 1) * share**2 * (3 - 2 * share)
+    plate = flared(plate, shape.length, shape.flare)
     if not (shape.bow or shape.twist):
         return plate
     rates = torch.deg2rad(torch.tensor([shape.bow, 0.0, shape.twist], dtype=torch.float64)) / shape.length
     half = shape.length / 2
-    contour = RodMotion(lambda z: rates.expand(len(z), 3), (-half, half))
-    bent = contour(torch.from_numpy(np.array(plate.vertices)))
-    return trimesh.Trimesh(bent.numpy(), plate.faces, process=False)
+    return mapped(plate, RodMotion(lambda z: rates.expand(len(z), 3), (-half, half)))
 
 
 def specimen(
