@@ -3,10 +3,13 @@
 import pytest
 import torch
 
+from torchkcreg.kernels import kernel
 from torchkcreg.splines import ControlPointGrid, cubic_bspline_weights
-from torchkcreg.splines.basis import _POINTS_PER_BLOCK, SplineBasis
+from torchkcreg.splines.basis import _POINTS_PER_BLOCK, SPLINE_EVALUATE, SplineBasis
 
 GRID = ControlPointGrid((5, 6, 7), (2.0, 3.0, 4.0), torch.eye(4))
+
+evaluate = kernel(SPLINE_EVALUATE, torch.zeros(0, device="cpu"), "cpp")
 
 
 def scattered(count, seed=0, dtype=torch.float64):
@@ -41,6 +44,30 @@ def test_cells_with_more_points_than_a_block_are_evaluated_in_parts():
     basis = SplineBasis(GRID, points)
     assert len(basis.cells) < 9
     assert torch.allclose(basis.evaluate(torch.ones(len(basis.cells), 64, 1, dtype=torch.float64)), points.new_ones(1))
+
+
+@pytest.mark.parametrize("values", (1, 2, 3, 4, 7))
+@pytest.mark.parametrize("orders", ((0, 0, 0), (1, 0, 2), (3, 0, 0), (0, 4, 1)))
+@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
+def test_the_kernel_is_the_reference_for_every_derivative_and_number_of_values(dtype, orders, values):
+    basis = SplineBasis(GRID, scattered(700, dtype=dtype))
+    generator = torch.Generator().manual_seed(values)
+    features = torch.rand(len(basis.cells), 64, values, generator=generator, dtype=dtype)
+    inputs = (basis.eta, features, basis._sorted.order, basis._sorted.ends, *orders)
+    close = {"rtol": 1e-5, "atol": 2e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
+    torch.testing.assert_close(evaluate(*inputs), SPLINE_EVALUATE.reference(*inputs), **close)
+
+
+def test_the_kernel_refuses_what_does_not_fit():
+    basis = SplineBasis(GRID, scattered(20))
+    order, ends = basis._sorted.order, basis._sorted.ends
+    features = torch.rand(len(basis.cells), 64, 3, dtype=torch.float64)
+    with pytest.raises(RuntimeError, match="features must have shape"):
+        evaluate(basis.eta, features[:, :27], order, ends, 0, 0, 0)
+    with pytest.raises(RuntimeError, match="the last cell must end with the last point"):
+        evaluate(basis.eta, features, order, ends - 1, 0, 0, 0)
+    with pytest.raises(RuntimeError, match="of one dtype"):
+        evaluate(basis.eta, features.float(), order, ends, 0, 0, 0)
 
 
 def test_scatter_is_the_adjoint_of_evaluate():

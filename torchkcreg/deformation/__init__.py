@@ -18,7 +18,7 @@ from torchkcreg.deformation.groups import (
 )
 from torchkcreg.deformation.linear import LinearDeformation, LinearMotion, RigidDeformation
 from torchkcreg.deformation.modal_motion import ModalMotion
-from torchkcreg.deformation.model import Deformation, Level, Motion
+from torchkcreg.deformation.model import Deformation, Level, Motion, combined
 from torchkcreg.deformation.penalty import diffusion_penalty, without_rigid
 from torchkcreg.deformation.prior import BendingPrior
 from torchkcreg.deformation.reading import deformation_from_dict
@@ -46,6 +46,7 @@ __all__ = [
     "bent_cloud",
     "bent_hold",
     "cluster_control_points",
+    "combined",
     "control_point_volumes",
     "control_points_from_groups",
     "deformation_from_dict",

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.deformation.groups import group_moment_gradients, moment_features
+from torchkcreg.deformation.model import combined
 from torchkcreg.deformation.strain import strain_energy
 from torchkcreg.geometry import transform_points
 from torchkcreg.splines.grid import ControlPointGrid
@@ -51,11 +52,19 @@ class Elasticity:
         """Mean energy density over Young's modulus, shape (K,); half a squared strain."""
         return strain_energy(self.gradients(steps), self.volumes)
 
-    def small_strains(self, steps: Tensor) -> Tensor:
-        """Strains of small steps from rest, (K, 9 N), so weighted that half their squares sum to the energy."""
-        gradients = (self.slopes @ steps[:, None]).mT
-        return (0.5 * (gradients + gradients.mT) * self.share[:, None, None]).flatten(1)
+    def stiffness(self, slopes: Tensor) -> Tensor:
+        """Second derivatives (D, D) of the energy at rest along D directions, given as slopes (D, 4 G, 3).
+
+        Strains ``(H + H^T) / 2`` of small gradients H have the squares ``(H : H + H : H^T) / 2``, and H is linear in a
+        few numbers: what the implant's nodes add is summed once, over them alone.
+        """
+        weighed = self.slopes * self.share[:, None, None]  # (N, 3, 4 G): by the grid's axis, then by the number
+        among = torch.einsum("njf,nkg->jkfg", weighed, weighed)  # axes j and k, numbers f and g
+        straight = torch.einsum("jjfg->fg", among)
+        first = torch.einsum("dfi,fg,egi->de", slopes, straight, slopes)
+        second = torch.einsum("dfk,jkfg,egj->de", slopes, among, slopes)
+        return 0.5 * (first + second)
 
     def displacements(self, steps: Tensor) -> Tensor:
         """Displacements, (K, 3 N), so weighted that their squares sum to the mean square, mm^2."""
-        return ((self.moments @ steps) * self.share[:, None]).flatten(1)
+        return (combined(self.moments, steps) * self.share[:, None]).flatten(1)

@@ -100,8 +100,8 @@ def _derivatives(groups: GroupMotion, elasticity: Elasticity) -> tuple[Tensor, T
     """At rest: those (P, S) of the displacements, and the second ones (P, P) of their mean square and of the energy."""
     offsets = _DIFFERENCE_MM * torch.eye(groups.num_parameters, dtype=torch.float64, device=groups.centers.device)
     slopes = (groups.in_grid(offsets) - groups.in_grid(-offsets)) / (2 * _DIFFERENCE_MM)
-    moves, strains = elasticity.displacements(slopes), elasticity.small_strains(slopes)
-    return moves, moves @ moves.T, strains @ strains.T
+    moves = elasticity.displacements(slopes)
+    return moves, moves @ moves.T, elasticity.stiffness(slopes)
 
 
 def _generalized_eigenvectors(stiffness: Tensor, inertia: Tensor, number: int) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,12 @@ from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.parameters import ParameterBlock
 
 
+def combined(features: Tensor, coefficients: Tensor) -> Tensor:
+    """Displacements (K, N, 3) of points that know features (N, F), for coefficients (K, F, 3): one product for all."""
+    wide = coefficients.transpose(0, 1).flatten(1)
+    return (features @ wide).unflatten(1, (-1, 3)).transpose(0, 1)
+
+
 @dataclass(frozen=True)
 class Level:
     """How finely a deformation may move, from coarse to fine (section 2.3 of Cao et al. 2020).
@@ -58,7 +64,7 @@ class Motion(ParameterBlock, ABC):
 
     def displacement(self, points: Tensor, steps: Tensor) -> Tensor:
         """Displacements (K, N, 3) of points (N, 3) after steps (K, D), in the implant's frame, mm."""
-        return self.features(points) @ self.coefficients(steps)
+        return combined(self.features(points), self.coefficients(steps))
 
 
 class Deformation(nn.Module, ABC):

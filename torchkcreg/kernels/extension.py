@@ -12,7 +12,9 @@ import torch
 
 PACKAGE = Path(__file__).resolve().parent.parent
 SOURCES = (
+    "csrc/cpu/blur.cpp",
     "csrc/cpu/point_drr.cpp",
+    "csrc/cpu/splines.cpp",
     "csrc/cpu/transmission.cpp",
     "csrc/cpu/voxel_project.cpp",
     "csrc/cpu/voxel_backproject.cpp",

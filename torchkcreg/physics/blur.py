@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchkcreg.differentiable import linear
+from torchkcreg.kernels import Operator, choose_backend
+
 NUM_SIGMAS = 4.5
 SMALLEST_SIGMA = 1e-3
 
@@ -26,16 +29,27 @@ def gaussian_kernel(sigma_px: Tensor) -> Tensor:
     return samples / samples.sum(-1, keepdim=True)
 
 
-def gaussian_blur(images: Tensor, sigma_px: Tensor | float) -> Tensor:
+def gaussian_blur(images: Tensor, sigma_px: Tensor | float, *, backend: str = "auto") -> Tensor:
     """Images `(..., rows, cols)` blurred by a Gaussian; beyond the border they go on as their last pixels.
 
     Args:
         images: Images.
         sigma_px: Standard deviation in pixels, the same in both directions; one number for all.
+        backend: "auto", "cpp" or "torch".
+
+    Returns:
+        Differentiable in the images.
     """
     sigma = torch.as_tensor(sigma_px, dtype=images.dtype, device=images.device)
-    kernel = gaussian_kernel(sigma).tolist()
-    return convolve(convolve(images, kernel, -2), kernel, -1)
+    kernel = gaussian_kernel(sigma.detach())
+    if len(kernel) == 1:
+        return images * kernel
+    if choose_backend(images, backend, operator=BLUR.name).is_reference:
+        return _blurred(images, kernel)
+    flat = images.reshape(-1, *images.shape[-2:])
+    return linear(
+        flat, lambda x: BLUR.dispatched(x, kernel, False), lambda x: BLUR.dispatched(x, kernel, True)
+    ).reshape(images.shape)
 
 
 def convolve(images: Tensor, kernel: list[float], dim: int) -> Tensor:
@@ -76,3 +90,26 @@ def _add_scaled(total: Tensor, term: Tensor, scale: float) -> Tensor:
     if total.requires_grad:
         return total.add(term, alpha=scale)
     return total.add_(term, alpha=scale)
+
+
+def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
+    """Images correlated with an odd kernel along rows and columns."""
+    samples = kernel.tolist()
+    return convolve(convolve(images, samples, -2), samples, -1)
+
+
+def _blur(images: Tensor, kernel: Tensor, transposed: bool) -> Tensor:
+    """The definition, in plain torch; transposed, by autograd."""
+    if not transposed:
+        return _blurred(images, kernel)
+    leaf = torch.zeros_like(images).requires_grad_(True)
+    with torch.enable_grad():
+        return torch.autograd.grad(_blurred(leaf, kernel), leaf, images)[0]
+
+
+# images (B, rows, cols), kernel (odd,) -> (B, rows, cols)
+BLUR = Operator(
+    "blur(Tensor images, Tensor kernel, bool transposed) -> Tensor",
+    reference=_blur,
+    fake=lambda images, kernel, transposed: torch.empty_like(images),
+)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import Motion
+from torchkcreg.deformation import Motion, combined
 from torchkcreg.geometry import fit_rigid, rotation_about, transform_points
 
 from .assembly import Assembly
@@ -53,4 +53,4 @@ class BoundMotion:
 def _moved(bound: tuple[Tensor, Tensor], coefficients: Tensor) -> Tensor:
     """World positions (K, N, 3) for coefficients (K, F, 3) in the world's axes."""
     world, features = bound
-    return world + features @ coefficients.to(features)
+    return world + combined(features, coefficients.to(features))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import Level
+from torchkcreg.deformation import Level, combined
 from torchkcreg.implant import Screw
 from torchkcreg.parameters import ParameterBlock, ParameterBlocks
 
@@ -152,7 +152,7 @@ class _Part:
 
     def displacements(self, steps: Tensor) -> Tensor:
         """Displacements (K, 3 N) of the nodes, weighted."""
-        return ((self.features @ self.bound.motion.coefficients(steps)) * self.share).flatten(1)
+        return (combined(self.features, self.bound.motion.coefficients(steps)) * self.share).flatten(1)
 
     def accept(self, steps: dict[str, Tensor]) -> None:
         """Moves the assembly."""

@@ -2,24 +2,51 @@
 
 All points of a knot cell (the box between eight neighbouring control points) share the same 64 control points. Sorted
 by cell, a spline is then a product of a (points, 64) matrix, built in cache and thrown away, with a (64, features)
-matrix: no gathering of 64 values a point, and nothing of size N x 64 in memory, in the backward pass neither.
+matrix: no gathering of 64 values a point, and nothing of size N x 64 in memory, in the backward pass neither. The
+kernel in ``csrc/cpu/splines.cpp`` takes the same points in the same order.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchkcreg.differentiable import one_by_one
+from torchkcreg.kernels import Operator, kernel
 from torchkcreg.splines.bspline import bspline_pieces
 from torchkcreg.splines.grid import ControlPointGrid
 
 _POINTS_PER_BLOCK = 1024  # (64, 1024) weights stay in a core's cache
 _Orders = tuple[int, int, int]
-_Blocks = list[tuple[int, Tensor]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sorted:
+    """Points sorted by the knot cell that they lie in.
+
+    Attributes:
+        order: Indices (N,) of the points, those of the first cell first.
+        ends: Where each cell's points end in them, (num_cells,).
+    """
+
+    order: Tensor
+    ends: Tensor
+
+    @functools.cached_property
+    def blocks(self) -> list[tuple[int, Tensor]]:
+        """The points in blocks of bounded size: the cell, the points' indices."""
+        sizes = self.ends.diff(prepend=self.ends.new_zeros(1)).tolist()
+        return [
+            (cell, block)
+            for cell, rows in enumerate(self.order.split(sizes))
+            for block in rows.split(_POINTS_PER_BLOCK)
+            if len(block)
+        ]
 
 
 class SplineBasis:
@@ -47,7 +74,7 @@ class SplineBasis:
         knots = grid.to_grid(points) / spacing
         below = knots.detach().floor()
         self.eta = (knots - below).to(dtype or points.dtype)
-        self.cells, self._blocks = _sort_by_cell(below.long() - 1)
+        self.cells, self._sorted = _sort_by_cell(below.long() - 1)
         self._shape = grid.shape
 
     def control_points(self) -> tuple[Tensor, Tensor]:
@@ -69,7 +96,7 @@ class SplineBasis:
             features: of the CPs of each cell, shape (num_cells, 64, F), in the basis's dtype.
             orders: of the derivative along each grid axis, in units of the spacing.
         """
-        return _Evaluate.apply(self.eta, features, self._blocks, orders)
+        return _Evaluate.apply(self.eta, features, self._sorted, orders)
 
     def scatter(self, values: Tensor, orders: _Orders = (0, 0, 0)) -> Tensor:
         """Adjoint of `evaluate`: ``sum_n B_c(x_n) values_n`` for the CPs of each cell, shape (num_cells, 64, F).
@@ -78,12 +105,12 @@ class SplineBasis:
             values: of the points, shape (N, F), in the basis's dtype.
             orders: as in `evaluate`.
         """
-        return _Scatter.apply(self.eta, values, self._blocks, orders, len(self.cells))
+        return _Scatter.apply(self.eta, values, self._sorted, orders, len(self.cells))
 
     def gradients(self) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Block by block of points in one cell: the cell, the points' indices (n,), and d B_c / d eta, (64, 3, n)."""
         along = [_Workspace(self.eta.detach(), orders) for orders in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
-        for cell, rows in self._blocks:
+        for cell, rows in self._sorted.blocks:
             yield cell, rows, torch.stack([weights(rows) for weights in along], dim=1)
 
 
@@ -92,28 +119,24 @@ class _Splines(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        eta, data, ctx.blocks, ctx.orders, *ctx.sizes = inputs
+        eta, data, ctx.points, ctx.orders, *ctx.sizes = inputs
         ctx.save_for_backward(eta, data)
         ctx.save_for_forward(eta, data)
 
 
 class _Evaluate(_Splines):
     @staticmethod
-    def forward(eta: Tensor, features: Tensor, blocks: _Blocks, orders: _Orders) -> Tensor:
-        weights, size = _Workspace(eta, orders), features.shape[-1]
-        out, block = features.new_empty(len(eta), size), features.new_empty(_POINTS_PER_BLOCK, size)
-        for cell, rows in blocks:
-            out.index_copy_(0, rows, torch.mm(weights(rows).T, features[cell], out=block[: len(rows)]))
-        return out
+    def forward(eta: Tensor, features: Tensor, points: _Sorted, orders: _Orders) -> Tensor:
+        return kernel(SPLINE_EVALUATE, eta, "auto")(eta, features, points.order, points.ends, *orders)
 
     @staticmethod
     def jvp(ctx: Any, along: Tensor | None, tangent: Tensor | None, *_: None) -> Tensor:
         eta, features = ctx.saved_tensors
         total = features.new_zeros(())
         if tangent is not None:
-            total = total + _Evaluate.apply(eta, tangent, ctx.blocks, ctx.orders)
+            total = total + _Evaluate.apply(eta, tangent, ctx.points, ctx.orders)
         if along is not None:
-            slopes = [_Evaluate.apply(eta, features, ctx.blocks, o) for o in _steeper(ctx.orders)]
+            slopes = [_Evaluate.apply(eta, features, ctx.points, o) for o in _steeper(ctx.orders)]
             total = total + sum(along[:, a : a + 1] * slope for a, slope in enumerate(slopes))
         return total
 
@@ -127,16 +150,16 @@ class _Evaluate(_Splines):
         grad_eta = _slope(eta, features, grad, ctx) if ctx.needs_input_grad[0] else None
         grad_features = None
         if ctx.needs_input_grad[1]:
-            grad_features = _Scatter.apply(eta, grad, ctx.blocks, ctx.orders, len(features))
+            grad_features = _Scatter.apply(eta, grad, ctx.points, ctx.orders, len(features))
         return grad_eta, grad_features, None, None
 
 
 class _Scatter(_Splines):
     @staticmethod
-    def forward(eta: Tensor, values: Tensor, blocks: _Blocks, orders: _Orders, num_cells: int) -> Tensor:
+    def forward(eta: Tensor, values: Tensor, points: _Sorted, orders: _Orders, num_cells: int) -> Tensor:
         out = values.new_zeros(num_cells, 64, values.shape[-1])
         weights = _Workspace(eta, orders)
-        for cell, rows in blocks:
+        for cell, rows in points.blocks:
             out[cell].addmm_(weights(rows), values[rows])
         return out
 
@@ -145,10 +168,10 @@ class _Scatter(_Splines):
         eta, values = ctx.saved_tensors
         total = values.new_zeros(())
         if tangent is not None:
-            total = total + _Scatter.apply(eta, tangent, ctx.blocks, ctx.orders, *ctx.sizes)
+            total = total + _Scatter.apply(eta, tangent, ctx.points, ctx.orders, *ctx.sizes)
         if along is not None:
             for a, orders in enumerate(_steeper(ctx.orders)):
-                total = total + _Scatter.apply(eta, along[:, a : a + 1] * values, ctx.blocks, orders, *ctx.sizes)
+                total = total + _Scatter.apply(eta, along[:, a : a + 1] * values, ctx.points, orders, *ctx.sizes)
         return total
 
     @staticmethod
@@ -161,13 +184,13 @@ class _Scatter(_Splines):
         grad_eta = _slope(eta, grad, values, ctx) if ctx.needs_input_grad[0] else None
         grad_values = None
         if ctx.needs_input_grad[1]:
-            grad_values = _Evaluate.apply(eta, grad, ctx.blocks, ctx.orders)
+            grad_values = _Evaluate.apply(eta, grad, ctx.points, ctx.orders)
         return grad_eta, grad_values, None, None, None
 
 
 def _slope(eta: Tensor, features: Tensor, values: Tensor, ctx: Any) -> Tensor:
     """Gradient (N, 3) by eta of ``sum_n values_n . spline(x_n)``: derivatives are splines again."""
-    slopes = (_Evaluate.apply(eta, features, ctx.blocks, o) for o in _steeper(ctx.orders))
+    slopes = (_Evaluate.apply(eta, features, ctx.points, o) for o in _steeper(ctx.orders))
     return torch.stack([(values * slope).sum(-1) for slope in slopes], dim=-1)
 
 
@@ -198,17 +221,31 @@ class _Workspace:
         return torch.mul(pairs[:, :, None], z, out=self.weights[: 64 * n].view(4, 4, 4, n)).view(64, n)
 
 
-def _sort_by_cell(lowest: Tensor) -> tuple[Tensor, _Blocks]:
-    """Occupied cells (num_cells, 3), and the points of each in blocks of bounded size: (cell, indices of points)."""
+def _sort_by_cell(lowest: Tensor) -> tuple[Tensor, _Sorted]:
+    """Occupied cells (num_cells, 3), and the points sorted by cell."""
     if len(lowest) == 0:
-        return lowest, []
+        return lowest, _Sorted(lowest[:, 0], lowest[:, 0])
     start = lowest.amin(0)
     extent = (lowest.amax(0) - start + 1).tolist()
     x, y, z = (lowest - start).unbind(-1)
     key, order = torch.sort((x * extent[1] + y) * extent[2] + z, stable=True)
     _, counts = torch.unique_consecutive(key, return_counts=True)
-    blocks: _Blocks = []
-    for cell, rows in enumerate(order.split(counts.tolist())):
-        blocks += [(cell, block) for block in rows.split(_POINTS_PER_BLOCK)]
-    first = order[counts.cumsum(0) - counts]
-    return lowest[first], blocks
+    ends = counts.cumsum(0)
+    return lowest[order[ends - counts]], _Sorted(order, ends)
+
+
+def _evaluated(eta: Tensor, features: Tensor, order: Tensor, ends: Tensor, x: int, y: int, z: int) -> Tensor:
+    """The definition, in plain torch."""
+    weights, size = _Workspace(eta, (x, y, z)), features.shape[-1]
+    out, block = features.new_empty(len(eta), size), features.new_empty(_POINTS_PER_BLOCK, size)
+    for cell, rows in _Sorted(order, ends).blocks:
+        out.index_copy_(0, rows, torch.mm(weights(rows).T, features[cell], out=block[: len(rows)]))
+    return out
+
+
+# eta (N, 3), features (num_cells, 64, F), order (N,), ends (num_cells,), orders of the derivative -> (N, F)
+SPLINE_EVALUATE = Operator(
+    "spline_evaluate(Tensor eta, Tensor features, Tensor order, Tensor ends, int x, int y, int z) -> Tensor",
+    reference=_evaluated,
+    fake=lambda eta, features, order, ends, x, y, z: features.new_empty(eta.shape[0], features.shape[2]),
+)
