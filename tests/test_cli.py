@@ -279,7 +279,7 @@ def test_bad_pixels_are_masked_counted_and_said_in_one_line(small_case, tmp_path
         ({"material": "unobtainium"}, "unobtainium"),
         ({"preset": "fast"}, "preset"),
         ({"backend": "fortran"}, "backend"),
-        ({"backend": "triton"}, "backend must be one of auto, cpp, torch"),
+        ({"backend": "triton"}, 'backend "triton" needs tensors on cuda'),
         ({"pitch": -1}, "pitch_mm"),
         ({"pitch": "fine"}, "--pitch"),
         ({"seed": "x"}, "--seed"),

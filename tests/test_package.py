@@ -93,7 +93,7 @@ def test_the_page_on_extending_runs_from_start_to_end(capsys):
     for block in blocks:
         exec(compile(block, "extend.md", "exec"), space)
     out = capsys.readouterr().out
-    assert "RegistrationResult(" in out and "('auto', 'cpp', 'torch') True False" in out
+    assert "RegistrationResult(" in out and "('auto', 'cpp', 'triton', 'torch') True False" in out
 
 
 def test_the_page_on_elastic_bodies_runs(capsys):

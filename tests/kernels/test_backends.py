@@ -19,7 +19,7 @@ def of_device(name: str) -> SimpleNamespace:
 def test_the_reference_comes_last_and_serves_everything() -> None:
     assert BACKENDS[-1].is_reference and not any(backend.is_reference for backend in BACKENDS[:-1])
     assert BACKENDS[-1].serves("anything", "any operator")
-    assert backend_names() == ("auto", "cpp", "torch")
+    assert backend_names() == ("auto", "cpp", "triton", "torch")
 
 
 def test_an_operator_without_a_kernel_is_its_reference_under_the_dispatcher() -> None:
@@ -33,9 +33,9 @@ def test_one_more_backend_is_one_line_in_the_table(monkeypatch: pytest.MonkeyPat
     own = Backend("own", frozenset({"cuda"}), lambda: None, operators=frozenset({"twice_for_tests"}))
     monkeypatch.setattr("torchkcreg.kernels.backends.BACKENDS", (own, *BACKENDS))
     assert choose_backend(of_device("cuda"), operator="twice_for_tests") is own
-    assert choose_backend(of_device("cuda"), operator="point_drr").is_reference
+    assert choose_backend(of_device("cuda"), operator="voxel_project").is_reference
     assert choose_backend(of_device("cpu"), operator="twice_for_tests").name == "cpp"
-    with pytest.raises(ValueError, match="backend must be one of auto, own, cpp, torch, got 'other'"):
+    with pytest.raises(ValueError, match="backend must be one of auto, own, cpp, triton, torch, got 'other'"):
         choose_backend(of_device("cuda"), "other")
     with pytest.raises(ValueError, match='backend "own" needs tensors on cuda, got cpu'):
         choose_backend(of_device("cpu"), "own")

@@ -232,8 +232,8 @@ POINTS = torch.zeros(4, 3)
         ({"cell": None}, "either cell or footprint"),
         ({"footprint": cell_footprint(POINTS, CELL, camera(0))}, "either cell or footprint"),
         ({"cell": None, "footprint": cell_footprint(POINTS, CELL, camera(0), block_size=2)}, "3 views and 1 blocks"),
-        ({"backend": "fast"}, "backend must be one of auto, cpp, torch"),
-        ({"backend": "triton"}, "backend must be one of auto, cpp, torch, got 'triton'"),
+        ({"backend": "fast"}, "backend must be one of auto, cpp, triton, torch"),
+        ({"backend": "triton"}, 'backend "triton" needs tensors on cuda, got cpu'),
     ],
 )
 def test_wrong_input_is_named(change, message):

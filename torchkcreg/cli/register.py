@@ -38,7 +38,7 @@ def add_register(commands) -> None:
     command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
     command.add_argument("--seed", type=int, help="seed of the random numbers")
     command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
-    command.add_argument("--backend", help="projector: auto, cpp or torch")
+    command.add_argument("--backend", help="projector: auto, cpp, triton or torch")
     command.add_argument("--device", help="where it is computed: cpu (default), cuda, cuda:1, ...")
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
     existing = command.add_mutually_exclusive_group()

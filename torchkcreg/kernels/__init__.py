@@ -1,5 +1,6 @@
 """Operators of torch's dispatcher (`torch.ops.torchkcreg`) and the backends that serve them: a readable reference in
-plain torch for any device, and C++ for CPUs. The C++ sources are in ``csrc``, the derivatives in `differentiable`."""
+plain torch for any device, C++ for CPUs (sources in ``csrc``), Triton for GPUs (in ``gpu``). The derivatives are in
+`differentiable`."""
 
 from .backend import Backend
 from .backends import BACKENDS, backend_names, choose_backend, kernel

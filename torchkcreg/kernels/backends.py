@@ -13,9 +13,24 @@ from .backend import Backend
 from .extension import unavailable_reason
 from .operator import Operator
 
+_TRITON = frozenset({"blur", "point_drr", "spline_evaluate", "transmission"})
+
+
+@functools.cache
+def _triton_unavailable() -> str | None:
+    """None where Triton's kernels are the dispatcher's, else why they are not."""
+    try:
+        from .gpu import KERNELS
+    except ImportError as error:
+        return f"{error}; pip install triton"
+    Operator.register(KERNELS, "CUDA")
+    return None
+
+
 # The first that serves a request is what "auto" takes.
 BACKENDS: tuple[Backend, ...] = (
     Backend("cpp", frozenset({"cpu"}), unavailable_reason),
+    Backend("triton", frozenset({"cuda"}), _triton_unavailable, operators=_TRITON),
     Backend("torch", None, lambda: None, is_reference=True),
 )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -27,6 +27,12 @@ class Operator:
         _LIBRARY.define(schema)
         _LIBRARY.impl(self.name, reference, "CompositeExplicitAutograd")
         torch.library.register_fake(f"torchkcreg::{self.name}", fake)
+
+    @staticmethod
+    def register(kernels: Mapping[str, Callable[..., Any]], device: str) -> None:
+        """Gives the dispatcher kernels, by the names of their operators, for a type of device such as "CUDA"."""
+        for name, kernel in kernels.items():
+            _LIBRARY.impl(name, kernel, device)
 
     @property
     def dispatched(self) -> Callable[..., Any]:

@@ -35,7 +35,7 @@ def gaussian_blur(images: Tensor, sigma_px: Tensor | float, *, backend: str = "a
     Args:
         images: Images.
         sigma_px: Standard deviation in pixels, the same in both directions; one number for all.
-        backend: "auto", "cpp" or "torch".
+        backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
         Differentiable in the images.

@@ -35,7 +35,7 @@ def transmission(
         kernel: One-dimensional blur kernels, (K, odd), applied along rows and columns, the border repeated; none if not
             given.
         pooling: Blurred transmissions are averaged over squares of this many pixels a side.
-        backend: "auto", "cpp" or "torch".
+        backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
         Differentiable in everything: first gradients by formulas of their own, all other derivatives by those of plain

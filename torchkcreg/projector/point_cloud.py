@@ -45,7 +45,8 @@ def project_points(
             8192 nodes. Either `cell` or `footprint`.
         footprint: ready-made, to reuse for poses up to some 5 degrees off: the path lengths stay right, stripes stay
             below 0.2 %.
-        backend: "auto" (C++ on the CPU if it can be had, else torch), "cpp" or "torch". All give the same numbers.
+        backend: "auto" (C++ on a CPU, Triton on a GPU, torch where they cannot be had), or one of them: "cpp",
+            "triton", "torch". All give the same numbers up to rounding.
 
     Returns:
         Path lengths in mm, shape (..., V, rows, cols), same bits for every number of threads.
@@ -138,7 +139,7 @@ class PointCloudProjector(nn.Module):
     Args:
         geometry: anything with ``projection_matrices`` (V, 3, 4) and ``det_shape`` (rows, cols), a
             ``ConeBeamGeometry`` for one. A module moves with this one.
-        backend: "auto", "cpp" or "torch".
+        backend: "auto", "cpp", "triton" or "torch".
     """
 
     def __init__(self, geometry, *, backend: str = "auto") -> None:

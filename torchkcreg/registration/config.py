@@ -185,7 +185,7 @@ class RegistrationConfig(Config):
         screw_materials: What they may be made of, besides the implant's own material.
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
-        backend: Projector: "auto", "cpp" or "torch".
+        backend: Projector: "auto", "cpp", "triton" or "torch".
         view_motion: Whether views may have stood otherwise than the geometry has it: "off", "on", or "auto" where the
             images ask for it.
         view_motion_mm: How far, standard deviation along each axis, mm; as far by rotation.

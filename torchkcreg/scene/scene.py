@@ -30,7 +30,7 @@ class Scene(nn.Module):
         intensity: Path lengths of the materials, in the order of :attr:`materials`, to line integrals.
         metals: Names of materials that screws found in the implants' holes may be of, besides the implants' own.
         materials: Names in the order of the path lengths; those of implants, metals and components when None.
-        backend: Of the projector: "auto", "cpp" or "torch".
+        backend: Of the projector: "auto", "cpp", "triton" or "torch".
 
     Attributes:
         view_motions: How the scene stood in each measured view against where the geometry has it; None: as it has it.

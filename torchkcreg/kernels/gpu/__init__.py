@@ -1,0 +1,23 @@
+"""Kernels for GPUs, written in Triton, and how they are told to torch's dispatcher.
+
+With ``TRITON_INTERPRET=1`` set before Triton is first imported they run, slowly, on CPU tensors.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from .beam import transmission, transmission_backward
+from .filters import blur
+from .points import point_drr, point_drr_backward
+from .splines import spline_evaluate
+
+KERNELS: dict[str, Callable[..., Any]] = {
+    "blur": blur,
+    "point_drr": point_drr,
+    "point_drr_backward": point_drr_backward,
+    "spline_evaluate": spline_evaluate,
+    "transmission": transmission,
+    "transmission_backward": transmission_backward,
+}
+
+__all__ = ["KERNELS"]
