@@ -12,8 +12,6 @@ Writes voxel_projector.md and voxel_projector.png.
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import platform
 import time
 from collections.abc import Callable
 from importlib import metadata
@@ -21,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from common import installed, processor
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
@@ -202,14 +201,6 @@ def measure(threads: int, rounds: int, names: list[str]) -> list[tuple[str, str,
     return rows
 
 
-def processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
-
-
 def table(rows: list[tuple[str, str, int, float, str]], names: list[str], left_out: list[str]) -> str:
     versions = [f"{name} {metadata.version(name)}" for name in ("torch", *names[1:])]
     times = {(step, name, threads): seconds for step, name, threads, seconds, _ in rows}
@@ -260,12 +251,12 @@ def draw(rows: list[tuple[str, str, int, float, str]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     modules = {"itk-rtk": "itk.RTKPython", "mbirtorch": "mbirtorch", "torchkcreg": "torchkcreg"}
     left_out = [name for name in LIBRARIES if not installed(modules[name])]
     names = [name for name in LIBRARIES if name not in left_out]
@@ -277,13 +268,6 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "voxel_projector.md").write_text(text)
     draw(rows, options.out / "voxel_projector.png")
-
-
-def installed(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:
-        return False
 
 
 if __name__ == "__main__":

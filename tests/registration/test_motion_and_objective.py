@@ -73,16 +73,20 @@ def test_the_gradient_is_that_of_the_loss(config: RegistrationConfig) -> None:
     assert float(ahead - behind) / 0.02 == pytest.approx(float(gradient @ direction), rel=0.02)
 
 
-def test_the_curvature_is_the_loss_s_second_derivative_at_the_optimum() -> None:
+@pytest.mark.parametrize(("on_coarse_pixels", "within"), [(False, 0.1), (True, 0.4)])
+def test_the_curvature_is_the_loss_s_second_derivative_at_the_optimum(on_coarse_pixels: bool, within: float) -> None:
     here = scene(PLAIN)
     rigid = objective(here, image(here), Stage(groups=1, oversampling=2), PLAIN)
+    assert rigid.coarse is not None and rigid.coarse.view.pixel_px == 2 * rigid.view.pixel_px
+    if not on_coarse_pixels:
+        rigid.coarse = None
     curvature = rigid.curvature(_zeros(rigid))
     torch.testing.assert_close(curvature, curvature.T)
     assert (torch.linalg.eigvalsh(curvature) > 0).all()
     for direction in torch.eye(6, dtype=torch.float64):
         ahead, here_, behind = rigid.losses(torch.stack([0.05 * direction, 0 * direction, -0.05 * direction]))
         measured = float(ahead - 2 * here_ + behind) / 0.05**2
-        assert measured == pytest.approx(float(direction @ curvature @ direction), rel=0.1)
+        assert measured == pytest.approx(float(direction @ curvature @ direction), rel=within)
 
 
 def test_moving_the_implant_is_moving_the_gantry_back() -> None:

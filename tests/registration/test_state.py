@@ -11,6 +11,7 @@ from test_register import PLAIN
 
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.optimization import CMAES, GaussNewton, Optimizer, iterate
+from torchkcreg.optimization.gauss_newton import learned
 from torchkcreg.registration import Stage, Trainer, build_scene
 
 
@@ -99,3 +100,15 @@ def test_a_parameter_at_its_bound_does_not_lead_the_others_astray() -> None:
     stage = Stage(optimizer="gauss-newton", iterations=3, tolerance=1e-9, step_mm=10.0)
     found = minimum(GaussNewton(_Valley(), stage, 0))
     torch.testing.assert_close(found, torch.tensor([0.0, 0.01], dtype=torch.float64), atol=1e-3, rtol=0)
+
+
+def test_a_step_teaches_the_curvature_along_it_and_never_makes_it_negative() -> None:
+    root = torch.rand(5, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    true, guess = root @ root.T + torch.eye(5), 0.4 * torch.eye(5, dtype=torch.float64)
+    for step in torch.eye(5, dtype=torch.float64):
+        guess = learned(guess, step, true @ step)
+        torch.testing.assert_close(guess @ step, true @ step)
+    step = torch.ones(5, dtype=torch.float64)
+    after = learned(guess, step, -3 * step)  # a gradient that fell along the step
+    assert float(torch.linalg.eigvalsh(after)[0]) > 0 and float(step @ after @ step) < float(step @ guess @ step)
+    torch.testing.assert_close(learned(guess, 0 * step, step), guess)

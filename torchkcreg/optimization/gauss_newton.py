@@ -45,8 +45,10 @@ class GaussNewton(Optimizer):
         gain = (self._loss - trial_loss) / max(predicted, 1e-16)
         taken = trial_loss < self._loss
         if taken:
+            before = self._gradient
             self._parameters = trial
             self._loss, self._gradient = self.problem.loss_and_gradient(trial)
+            self._curvature = learned(self._curvature, step, self._gradient - before)
             self._damping = max(self._damping / 5, 1e-6) if gain > 0.5 else self._damping * 2
             self._fresh = False
         else:
@@ -95,3 +97,17 @@ class GaussNewton(Optimizer):
         floor = 1e-6 * diagonal.mean()
         step = -torch.linalg.solve(curvature + torch.diag(self._damping * diagonal + floor), gradient)
         return step * min(1.0, self.stage.step_mm / max(float(step.abs().max()), 1e-12))
+
+
+def learned(curvature: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """The curvature (D, D) with what a step taught of it, by how the gradient changed along it (BFGS).
+
+    Powell's damping (1978) keeps it positive where the gradient fell along the step.
+    """
+    along = curvature @ step
+    expected, seen = float(step @ along), float(step @ change)
+    if not expected > 0:
+        return curvature
+    share = 1.0 if seen >= 0.2 * expected else 0.8 * expected / (expected - seen)
+    change = share * change + (1 - share) * along
+    return curvature - torch.outer(along, along) / expected + torch.outer(change, change) / float(step @ change)

@@ -16,6 +16,7 @@ from .uncertainty import Uncertainty, views_a_side
 Penalty = Callable[[State], Tensor]
 SimilarityFactory = Callable[[Tensor, Tensor | None, Tensor | None], Similarity]
 
+_PROBES = 4  # steps that tell how much more sharp images change than coarse ones
 _NODES_AT_ONCE = 5_000_000  # of all candidates that are rendered together: 60 MB of positions
 
 
@@ -29,6 +30,7 @@ class Objective:
         similarity: Makes the data term of measured images, mask and weights.
         penalties: Further terms: functions of K candidates to (K,), beside the priors of all that may change.
         weights: How much pixels count, shape (V, rows, cols); all alike if None.
+        coarse: The same on coarser pixels, which tell curvatures as well, at a fraction of the cost; this one if None.
 
     Raises:
         ValueError: If the view has no measured images.
@@ -43,8 +45,10 @@ class Objective:
         *,
         penalties: Sequence[Penalty] = (),
         weights: Tensor | None = None,
+        coarse: Objective | None = None,
     ) -> None:
         self.scene, self.view, self.moves, self.penalties = scene, view, moves, list(penalties)
+        self.coarse = coarse
         self.images = view.images
         self._make = similarity
         self.similarity = similarity(self.images.line_integrals, self.images.mask, weights)
@@ -95,12 +99,30 @@ class Objective:
 
     def curvature(self, parameters: Tensor, step_mm: float = 0.01) -> Tensor:
         """Gauss-Newton second derivatives (D, D): residual images differ by forward differences, penalties exactly."""
-        return self.curvature_from(self.jacobian(parameters, step_mm)[0], parameters)
+        if self.coarse is None:
+            return self.curvature_from(self.jacobian(parameters, step_mm)[0], parameters)
+        jacobian, _ = self.coarse.jacobian(parameters, step_mm)
+        return self.curvature_from(jacobian * self._sharper(jacobian, parameters, step_mm), parameters)
+
+    @torch.no_grad()
+    def _sharper(self, coarse: Tensor, parameters: Tensor, step_mm: float) -> float:
+        """How much more these images change than coarse ones, whose derivatives (D, ...) are given: along some steps.
+
+        Each step changes all parameters, one as much as another.
+        """
+        signs = torch.randint(0, 2, (_PROBES, self.num_parameters), generator=torch.Generator().manual_seed(0)) * 2 - 1
+        flat = coarse.flatten(1).double()
+        steps = signs.to(flat) / flat.norm(dim=1).clamp_min(max(1e-9 * float(flat.norm()), 1e-30))
+        steps = steps / steps.norm(dim=1, keepdim=True)
+        center = self._residuals(parameters[None])
+        fine = (self._residuals(parameters + step_mm * steps.to(parameters)) - center).flatten(1) / step_mm
+        shown = float((steps @ flat).norm())
+        return float(fine.norm()) / shown if shown > 0 else 1.0
 
     def curvature_from(self, jacobian: Tensor, parameters: Tensor) -> Tensor:
         """Second derivatives (D, D) where the derivatives of the residuals are known."""
         flat = jacobian.flatten(1)
-        penalty = torch.autograd.functional.hessian(lambda p: self.penalty(p[None])[0], parameters)
+        penalty = torch.autograd.functional.hessian(lambda p: self.penalty(p[None])[0], parameters, vectorize=True)
         return 0.5 / self.images.num_views * (flat @ flat.T).double() + penalty
 
     @torch.no_grad()
@@ -142,7 +164,10 @@ class Objective:
         images = self.line_integrals(self.at_rest)
         residuals = self.similarity.residuals(images)[0]
         weights = residual_weights(residuals, sobel_gradient(images)[0], self.images.mask)
-        return Objective(self.scene, self.view, self.moves, self._make, penalties=self.penalties, weights=weights)
+        coarse = None if self.coarse is None else self.coarse.reweighted()
+        return Objective(
+            self.scene, self.view, self.moves, self._make, penalties=self.penalties, weights=weights, coarse=coarse
+        )
 
     def accept(self, parameters: Tensor) -> None:
         """Moves the scene to parameters (D,)."""

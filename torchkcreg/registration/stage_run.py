@@ -35,6 +35,7 @@ class Terms:
 
 Step = Callable[["StageRun"], None]
 
+_CURVATURE_BIN, _CURVATURE_MM = 2, 2.0  # pixels on which curvatures are taken: coarser by this, up to this width
 _COARSE_BIN = 2  # an expected error needs no finer pixels
 
 
@@ -125,14 +126,14 @@ class StageRun:
             self.data = data_with_background(self.scene, self.data, self.config, bin)
             self.renew()
 
-    def view(self) -> View:
-        """What the stage sees."""
+    def view(self, coarser: int = 1) -> View:
+        """What the stage sees; on coarser pixels, of fewer nodes, where asked."""
         stage = self.stage
         return self.scene.view(
             self.data,
-            bin=stage.binning(self.data.geometry.pixel_spacing[1]),
+            bin=coarser * stage.binning(self.data.geometry.pixel_spacing[1]),
             oversampling=stage.oversampling,
-            pitch_factor=stage.pitch_factor,
+            pitch_factor=coarser * stage.pitch_factor,
             margin_mm=stage.margin_mm,
         )
 
@@ -155,7 +156,12 @@ class StageRun:
             views="views" in stage.estimate,
             prior_weight=self.config.prior_weight,
         )
-        return Objective(self.scene, view, moves, self.similarity(), penalties=self.terms.penalties)
+        make, penalties = self.similarity(), self.terms.penalties
+        coarse = None
+        if (stage.bin * _CURVATURE_BIN) * self.data.geometry.pixel_spacing[1] <= _CURVATURE_MM:
+            seen = self.view(coarser=_CURVATURE_BIN)
+            coarse = Objective(self.scene, seen, moves.seen_in(seen), make, penalties=penalties)
+        return Objective(self.scene, view, moves, make, penalties=penalties, coarse=coarse)
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from torchkcreg.precision import ExactModule
 
 from .state import Placement
 
-_MOST_FOLLOWED = 200
+_FOLLOWED = 200  # nodes of the implant that tell a component its motion
 _NODES_PITCH_MM = 2.0  # strain is smooth
 
 
@@ -72,12 +72,12 @@ class Assembly(ExactModule):
         self.register_buffer("implant_to_world", pose.to(device, torch.float64))
         self.register_buffer("tilts", torch.zeros(0, 3, dtype=torch.float64, device=device), persistent=False)
         self.found: list[Screw] = []
-        self.followed: list[Tensor] = []
+        self.followed = implant.points.new_zeros(0, _FOLLOWED, 3, dtype=torch.float64)
         self._set_components(components)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Assembly:
         super()._apply(fn, recurse)
-        self.followed = [points.to(self.implant_to_world.device) for points in self.followed]
+        self.followed = self.followed.to(self.implant_to_world.device)
         return self
 
     def place(self, screws: Sequence[Screw]) -> None:
@@ -89,7 +89,8 @@ class Assembly(ExactModule):
         device = self.implant.points.device
         self.components = nn.ModuleList(components).to(device)  # type: ignore[assignment]
         self.tilts = torch.zeros(len(components), 3, dtype=torch.float64, device=device)
-        self.followed = [followed_points(self.implant.points, c.head, self.follow_radius_mm) for c in components]
+        told = [followed_points(self.implant.points, c.head, self.follow_radius_mm) for c in components]
+        self.followed = torch.stack([*told, self.implant.points.new_zeros(_FOLLOWED, 3).double()])[: len(told)]
 
     def bare(self) -> Assembly:
         """The implant alone; deformation and holes are shared."""
@@ -121,15 +122,13 @@ class Assembly(ExactModule):
 
     def placement(self, nodes: Tensor) -> Placement:
         """Where nodes (N, 3) of the implant's frame, and the components, are now, as one candidate."""
-        poses = torch.stack([self.implant_to_world, *(self.implant_to_world @ m for m in self._motions())])[1:]
+        poses = self.implant_to_world @ self._motions()
         return Placement(self.warp(nodes).to(nodes)[None], (poses @ rotation_about(self.heads, self.tilts))[None])
 
-    def _motions(self) -> list[Tensor]:
-        """Rigid motion (4, 4) of each component in the implant's frame, all of what they follow moved at once."""
-        if not self.followed:
-            return []
-        moved = self.deformation(torch.cat(self.followed)).split([len(points) for points in self.followed])
-        return [fit_rigid(points, there) for points, there in zip(self.followed, moved, strict=True)]
+    def _motions(self) -> Tensor:
+        """Rigid motions (C, 4, 4) of the components in the implant's frame."""
+        moved = self.deformation(self.followed.flatten(0, 1)) if len(self.followed) else self.followed
+        return fit_rigid(self.followed, moved.reshape(self.followed.shape))
 
     def motion_at(self, head: Tensor) -> Tensor:
         """Rigid motion (4, 4) in the implant's frame of a component whose head is there, a point (3,)."""
@@ -192,8 +191,8 @@ def followed_motion(points: Tensor, head: Tensor, radius: float, moved: Callable
 
 
 def followed_points(points: Tensor, head: Tensor, radius: float) -> Tensor:
-    """The implant's points (n, 3), float64, near a component's head that tell how it moves; a few are enough."""
+    """The implant's points (200, 3), float64, near a component's head that tell how it moves; some repeated if few."""
     distance = torch.linalg.vector_norm(points - head.to(points), dim=-1)
     near = (distance <= torch.clamp(distance.min() * 1.5, min=radius)).nonzero().flatten()
-    stride = max(1, len(near) // _MOST_FOLLOWED)
-    return points[near[::stride]].double()
+    chosen = torch.arange(_FOLLOWED, device=points.device) * len(near) // _FOLLOWED
+    return points[near[chosen]].double()

@@ -26,7 +26,7 @@ class BoundMotion:
         self.turns = rotation_about(assembly.heads, assembly.tilts)
         self.nodes = self._bound(nodes.double(), nodes.dtype)
         self.at_rest = assembly.followed
-        self.followed = [self._bound(points, torch.float64) for points in assembly.followed]
+        self.followed = self._bound(assembly.followed.flatten(0, 1), torch.float64) if len(assembly.followed) else None
 
     def _bound(self, points: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """World positions (N, 3) of points at rest, and their features (N, F)."""
@@ -42,11 +42,10 @@ class BoundMotion:
         """
         coefficients = self.motion.coefficients(steps) @ self.pose[:3, :3].T
         turns = self.turns if component_motions is None else component_motions
-        follow = [
-            fit_rigid(points.expand(len(steps), -1, -1), _moved(bound, coefficients))
-            for points, bound in zip(self.at_rest, self.followed, strict=True)
-        ]
-        components = torch.stack(follow, dim=1) @ turns if follow else self.pose.new_zeros(len(steps), 0, 4, 4)
+        components = self.pose.new_zeros(len(steps), 0, 4, 4)
+        if self.followed is not None:
+            moved = _moved(self.followed, coefficients).unflatten(1, self.at_rest.shape[:2])
+            components = fit_rigid(self.at_rest, moved) @ turns
         return Placement(_moved(self.nodes, coefficients), components)
 
 

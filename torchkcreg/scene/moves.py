@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Sequence
 
@@ -63,7 +64,7 @@ class Moves(ParameterBlocks):
         blocks["physics"] = self.physics
         for part in self.parts:
             if screws and part.assembly.found:
-                part.shapes = ScrewShapes(part.assembly.found, functools.partial(screw_path, part.assembly, view))
+                part.shapes = part.screw_shapes(view)
                 blocks[f"screws of {part.name}"] = part.shapes
             if tilts and len(part.assembly.components):
                 part.tilts = ComponentTilts(part.assembly, prior_weight)
@@ -72,6 +73,17 @@ class Moves(ParameterBlocks):
         if views and scene.view_motions is not None:
             self.views = blocks["views"] = ViewMotionSteps(scene.view_motions)
         super().__init__(blocks)
+
+    def seen_in(self, view: View) -> Moves:
+        """The same moves, with the same parameters, as another view of the same scene shows them."""
+        other = copy.copy(self)
+        other.view, other._blocks = view, dict(self._blocks)
+        other.physics = other._blocks["physics"] = self.physics.on_pixels(view.pixel_px)
+        other.parts = [part.seen_in(view, nodes) for part, nodes in zip(self.parts, view.nodes, strict=True)]
+        for part in other.parts:
+            if part.shapes:
+                other._blocks[f"screws of {part.name}"] = part.shapes
+        return other
 
     def state(self, parameters: Tensor) -> State:
         """The scene's candidates with parameters (K, D)."""
@@ -149,6 +161,17 @@ class _Part:
         coarse = assembly.implant.coarsened_to(_NODES_PITCH_MM)
         self.share = (coarse.volumes.double() / coarse.volumes.double().sum()).sqrt()[:, None]
         self.features = self.bound.motion.features(coarse.points)
+
+    def screw_shapes(self, view: View) -> ScrewShapes:
+        """How the found screws' lengths and radii change the images of a view."""
+        return ScrewShapes(self.assembly.found, functools.partial(screw_path, self.assembly, view))
+
+    def seen_in(self, view: View, nodes: Tensor) -> _Part:
+        """The same, with other nodes that are rendered."""
+        other = copy.copy(self)
+        other.bound = BoundMotion(self.assembly, self.bound.motion, nodes)
+        other.shapes = self.screw_shapes(view) if self.shapes else None
+        return other
 
     def displacements(self, steps: Tensor) -> Tensor:
         """Displacements (K, 3 N) of the nodes, weighted."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import torch
@@ -33,6 +34,12 @@ class PhysicsParameters(ParameterBlock):
         self.high = (self._numbers(f.high for f in self.free) - self.start) / self.scale
         self.center = self._numbers(f.likely for f in self.free)
         self.width = self._numbers(f.deviation for f in self.free)
+
+    def on_pixels(self, pixel_px: float) -> PhysicsParameters:
+        """The same for images of other rendered pixels."""
+        other = copy.copy(self)
+        other.pixel_px = pixel_px
+        return other
 
     def _numbers(self, values) -> Tensor:
         device = next((p.device for p in self.intensity.parameters()), None)

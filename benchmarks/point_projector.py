@@ -1,0 +1,297 @@
+"""Time and accuracy of the point-cloud projector beside nanodrr and DiffDRR, in one run on one machine.
+
+    python benchmarks/point_projector.py [--threads 2] [--rounds 3] [--binning 2] [--out benchmarks/results]
+
+The ten-hole plate in the paper's three views. All render the same pixels. Nodes are drawn by a footprint that is
+made once, as in a registration; peers render voxels of the size of the nodes' lattice, each with its share of metal,
+by one ray a pixel, and nanodrr by several, too, that are averaged. Backwards, the images' gradient goes to every node
+here, and to the pose there, which is less. Errors are those of the exact chords, averaged over pixels. Then how the
+projector's time grows with nodes, views, candidates and threads. Peers that are not installed are left out with a word.
+Writes point_projector.md and point_projector.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import torch
+from common import best_times, installed, processor
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.projector import PointCloudProjector, cell_footprint, project_mesh
+from torchkcreg.simulation import locking_plate
+
+PITCH = 0.25
+RAYS_AT_ONCE = 4096  # of Siddon's method, which keeps every plane that a ray crosses
+FINER = 3
+BANDS = 8
+SAMPLES = 200  # of a ray inside the volume: of nanodrr, and DiffDRR's trilinear renderer
+Steps = dict[str, Callable[[], Tensor]]
+
+
+class Scene:
+    """A plate, its nodes, voxels and views, and the exact images."""
+
+    def __init__(self, binning: int) -> None:
+        self.mesh = locking_plate()
+        self.cloud = ImplantPointCloud.from_mesh(self.mesh, pitch=PITCH)
+        scanner = MultisourceScanner()
+        self.geometry = scanner.geometry().select(scanner.paper_views("3")).bin(binning)
+        self.truth = project_mesh(
+            torch.tensor(self.mesh.vertices),
+            torch.tensor(self.mesh.faces),
+            self.geometry.projection_matrices,
+            self.geometry.det_shape,
+        )
+        generator = torch.Generator().manual_seed(0)
+        self.upstream = torch.rand(self.truth.shape, generator=generator)
+
+    def error(self, images: Tensor) -> float:
+        """Root mean square error over that of the truth, per cent."""
+        return 100 * float((images.double() - self.truth).norm() / self.truth.norm())
+
+    def voxels(self) -> tuple[Tensor, Tensor]:
+        """Share of metal (x, y, z) in the lattice's cells, and the affine matrix (4, 4) from their indices."""
+        points = self.cloud.points.double()
+        steps = self.cloud.cell.double().diagonal()
+        index = ((points - points.amin(0)) / steps).round().long()
+        volume = torch.zeros(*(index.amax(0) + 1 + 2).tolist())
+        shares = (self.cloud.volumes.double() / steps.prod()).float()
+        volume.index_put_(tuple((index + 1).T), shares, accumulate=True)
+        affine = torch.diag(torch.cat([steps, steps.new_ones(1)]))
+        affine[:3, 3] = points.amin(0) - steps
+        return volume, affine
+
+
+def ours(scene: Scene) -> Steps:
+    projector, cloud = PointCloudProjector(scene.geometry), scene.cloud
+    footprint = cell_footprint(cloud.points, cloud.cell, scene.geometry.projection_matrices)
+    points = cloud.points.clone().requires_grad_(True)
+    return both(lambda: projector(points, cloud.volumes, footprint=footprint), points, scene.upstream)
+
+
+def mesh(scene: Scene) -> Steps:
+    vertices = torch.tensor(scene.mesh.vertices, requires_grad=True)
+    faces, geometry = torch.tensor(scene.mesh.faces), scene.geometry
+    render = lambda: project_mesh(vertices, faces, geometry.projection_matrices, geometry.det_shape)  # noqa: E731
+    return both(render, vertices, scene.upstream.double())
+
+
+def rays(geometry: ConeBeamGeometry) -> tuple[Tensor, Tensor]:
+    """Sources (V, 1, 3) and points (V, N, 3) behind the object on the rays through all pixels."""
+    sources, directions = geometry.source_positions.float(), geometry.rays().flatten(1, 2).float()
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    return sources[:, None], sources[:, None] + 600 * directions
+
+
+def nanodrr(scene: Scene, finer: int = 1) -> Steps:
+    """Its camera is put at the world's origin: sources and ends of rays are given in the world."""
+    from nanodrr.data import Subject
+    from nanodrr.drr.renderer import render
+
+    volume, affine = scene.voxels()
+    data, to_world = volume.permute(2, 1, 0)[None, None].contiguous(), affine.float()
+    subject = Subject(
+        data,
+        torch.zeros_like(data),
+        to_world,
+        affine.inverse().float(),
+        Subject._make_voxel_to_grid(data.shape),
+        torch.zeros(3),
+        max_label=0,
+        convert_to_mu=False,
+    )
+    sources, ends = rays(scene.geometry.refined(finer))
+    pose = torch.eye(4)[None].requires_grad_(True)
+    _, rows, cols = scene.truth.shape
+    size, nothing = finer * (rows // BANDS), torch.eye(3)[None]  # what a band keeps for its gradient fits in memory
+
+    def band(view: int, number: int) -> Tensor:
+        part = slice(number * size * cols * finer, (number + 1) * size * cols * finer)
+        source, end = sources[view : view + 1], ends[view : view + 1, part]
+        length = torch.ones(1)
+        image = render(subject, nothing, pose, length, size, cols * finer, n_samples=SAMPLES, src=source, tgt=end)
+        return avg_pool2d(image[0], finer)[0]
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            views = [torch.cat([band(view, number) for number in range(BANDS)]) for view in range(len(sources))]
+        return torch.stack(views)
+
+    def backward() -> Tensor:
+        total = torch.zeros_like(pose)
+        for view, upstream in enumerate(scene.upstream):
+            for number, part in enumerate(upstream.chunk(BANDS)):
+                total += torch.autograd.grad(band(view, number), pose, part)[0]
+        return total
+
+    return {"forward": forward, "and back": backward}
+
+
+def diffdrr(scene: Scene) -> Steps:
+    from diffdrr.renderers import Siddon
+
+    volume, affine = scene.voxels()
+    back = affine.inverse().float()
+    sources, ends = rays(scene.geometry)
+    pose = torch.eye(4).expand(len(sources), 4, 4).clone().requires_grad_(True)
+    renderer, shape = Siddon(), scene.truth.shape
+
+    def moved(points: Tensor) -> Tensor:
+        to_voxels = back @ pose
+        return points @ to_voxels[:, :3, :3].mT + to_voxels[:, None, :3, 3]
+
+    def images() -> Tensor:
+        parts = []
+        for some in ends.split(RAYS_AT_ONCE, dim=1):
+            length = (some - sources).norm(dim=-1)[:, None]
+            parts.append(renderer(volume, moved(sources), moved(some), length)[:, 0])
+        return torch.cat(parts, dim=1).reshape(shape)
+
+    return both(images, pose, scene.upstream)
+
+
+def both(images: Callable[[], Tensor], leaf: Tensor, upstream: Tensor) -> Steps:
+    """Forward alone, without autograd, and with the gradient to a leaf."""
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            return images()
+
+    return {"forward": forward, "and back": lambda: torch.autograd.grad(images(), leaf, upstream)[0]}
+
+
+LIBRARIES = {
+    "torchkcreg": (ours, "torchkcreg"),
+    "torchkcreg, mesh": (mesh, "torchkcreg"),
+    "nanodrr": (nanodrr, "nanodrr"),
+    f"nanodrr, {FINER} x {FINER} rays": (lambda scene: nanodrr(scene, FINER), "nanodrr"),
+    "DiffDRR": (diffdrr, "diffdrr"),
+}
+
+
+def measure(scene: Scene, threads: int, rounds: int, names: list[str]) -> list[tuple[str, str, int, float, float]]:
+    """Rows (step, library, threads, best seconds, error in per cent)."""
+    torch.set_num_threads(threads)
+    made = {name: LIBRARIES[name][0](scene) for name in names}
+    found: dict[str, Tensor] = {}
+
+    def keeping(name: str, step: str) -> Callable[[], None]:
+        def run() -> None:
+            found[name + step] = made[name][step]()
+
+        return run
+
+    times = best_times({(name, step): keeping(name, step) for name in names for step in made[name]}, rounds)
+    errors = {name: scene.error(found[f"{name}forward"]) for name in names}
+    return [(step, name, threads, seconds, errors[name]) for (name, step), seconds in times.items()]
+
+
+def growth(scene: Scene, rounds: int) -> list[tuple[str, int, float]]:
+    """Rows (what grows, how much there is, million node-views a second), forward."""
+    rows = []
+    scanner, cloud = MultisourceScanner(), scene.cloud
+
+    def rate(points: Tensor, nodes: Tensor, geometry: ConeBeamGeometry, cell: Tensor) -> float:
+        projector, footprint = PointCloudProjector(geometry), cell_footprint(points, cell, geometry.projection_matrices)
+        seconds = best_times({0: lambda: projector(points, nodes, footprint=footprint)}, rounds)[0]
+        return points.shape[:-1].numel() * len(geometry.projection_matrices) / seconds / 1e6
+
+    for factor in (4, 3, 2, 1):
+        coarse = cloud if factor == 1 else cloud.coarsened(factor)
+        rows.append(("nodes", len(coarse.points), rate(coarse.points, coarse.volumes, scene.geometry, coarse.cell)))
+    whole = scanner.geometry().bin(2)
+    for views in (1, 3, 12, 50):
+        chosen = whole.select(list(range(0, 200, 200 // views))[:views])
+        rows.append(("views", views, rate(cloud.points, cloud.volumes, chosen, cloud.cell)))
+    half = cloud.coarsened(2)
+    for candidates in (1, 10, 40):
+        points = half.points + 0.1 * torch.randn(candidates, 1, 3)
+        rows.append(("candidates", candidates, rate(points, half.volumes, scene.geometry, half.cell)))
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        rows.append(("threads", threads, rate(cloud.points, cloud.volumes, scene.geometry, cloud.cell)))
+    return rows
+
+
+def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: list[str]) -> str:
+    modules = dict.fromkeys(module for name, (_, module) in LIBRARIES.items() if name in names)
+    versions = [f"{module} {metadata.version(module)}" for module in ("torch", *modules) if module != "torchkcreg"]
+    times = {(step, name, threads): seconds for step, name, threads, seconds, _ in rows}
+    shape = "{} x {}".format(*scene.geometry.det_shape)
+    lines = [
+        "# Point-cloud projector",
+        "",
+        f"{len(scene.cloud.points)} nodes on a lattice of {PITCH} mm, 3 views of {shape}; best of some rounds, in "
+        f"turns. {processor()}; {', '.join(versions)}." + "".join(f" {name} is not installed." for name in left_out),
+        "",
+        "| step | library | threads | seconds | of torchkcreg's time | error, % |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for step, name, threads, seconds, error in sorted(rows, key=lambda row: (row[0] != "forward", row[2])):
+        ratio = seconds / times[step, "torchkcreg", threads]
+        lines.append(f"| {step} | {name} | {threads} | {seconds:.4f} | {ratio:.1f} | {error:.2f} |")
+    lines += [
+        "",
+        f"Error: root mean square against the exact chords, averaged over pixels; nanodrr takes {SAMPLES} samples of a "
+        "ray inside the volume. Back: the gradient to all nodes, or vertices, here; to the poses there.",
+        "",
+        "| what grows | to | million node-views a second |",
+        "| --- | --- | --- |",
+        *(f"| {what} | {number} | {rate:.0f} |" for what, number, rate in grown),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def draw(rows: list, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    most = max(row[2] for row in rows)
+    chosen = [row for row in rows if row[2] == most]
+    figure, axes = plt.subplots(figsize=(6, 3.8))
+    for step, marker in (("forward", "o"), ("and back", "s")):
+        points = [(error, seconds, name) for s, name, _, seconds, error in chosen if s == step]
+        axes.scatter([p[0] for p in points], [p[1] for p in points], marker=marker, label=step)
+        for error, seconds, name in points if step == "and back" else ():
+            axes.annotate(name, (error, seconds), xytext=(6, 4), textcoords="offset points", fontsize=8)
+    axes.set(xscale="symlog", yscale="log", xlabel="error, % RMS", ylabel=f"seconds, {most} threads")
+    axes.set_xlim(left=-0.1, right=10 ** math.ceil(math.log10(max(row[4] for row in chosen)) + 0.5))
+    axes.legend(frameon=False, loc="lower right")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, nargs="+", default=[2])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--binning", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    options = parser.parse_args(arguments)
+    left_out = [name for name, (_, module) in LIBRARIES.items() if not installed(module)]
+    names = [name for name in LIBRARIES if name not in left_out]
+    for name in left_out:
+        print(f"{name} is not installed and left out")
+    scene = Scene(options.binning)
+    rows = [row for threads in options.threads for row in measure(scene, threads, options.rounds, names)]
+    text = table(scene, rows, growth(scene, options.rounds), names, left_out)
+    print(text)
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "point_projector.md").write_text(text)
+    draw(rows, options.out / "point_projector.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""All benchmarks that compare with peers, in one run on one machine: tables and plots in a folder.
+
+    python benchmarks/run.py [--quick] [--out benchmarks/results]
+
+The point-cloud projector beside nanodrr and DiffDRR, the voxel projector beside itk-rtk and mbirtorch, and how long a
+registration takes, stage by stage. Peers come with `pip install nanodrr diffdrr itk-rtk mbirtorch`; those that are not
+there are left out with a word. `--quick`: one round, small images.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import point_projector
+import registration_time
+import voxel_projector
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    options = parser.parse_args()
+    out, rounds = ["--out", str(options.out)], ["--rounds", "1"] if options.quick else []
+    point_projector.main([*out, *rounds, *(["--binning", "8"] if options.quick else [])])
+    voxel_projector.main([*out, *rounds])
+    registration_time.main([*out, *rounds])
+
+
+if __name__ == "__main__":
+    main()
