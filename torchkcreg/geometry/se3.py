@@ -127,6 +127,9 @@ def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
     _check_last("matrix", matrix, 4, 4)
     _check_last("points", points, 3)
     matrix = matrix.to(points.dtype)
+    if matrix.dim() == 2:  # one pass over the points
+        flat = torch.addmm(matrix[:3, 3], points.reshape(-1, 3), matrix[:3, :3].mT)
+        return flat.reshape(points.shape)
     return points @ matrix[..., :3, :3].mT + matrix[..., None, :3, 3]
 
 
