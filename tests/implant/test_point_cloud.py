@@ -215,3 +215,14 @@ def test_a_cloud_made_in_inference_mode_coarsens_too() -> None:
     with torch.inference_mode():
         cloud = ImplantPointCloud.from_mesh(trimesh.creation.box((4.0, 4.0, 8.0)), pitch=0.5)
     assert cloud.coarsened(2).volume == pytest.approx(cloud.volume)
+
+
+def test_a_mapped_cloud_is_that_of_the_mapped_mesh_in_the_same_order() -> None:
+    cloud = ImplantPointCloud.from_mesh(trimesh.creation.box((2.0, 3.0, 10.0)), pitch=0.5)
+    linear = torch.tensor([[1.0, 0.1, 0.0], [0.0, 2.0, 0.0], [0.3, 0.0, 0.5]])
+    shift = torch.tensor([4.0, 5.0, 6.0])
+    mapped = cloud.mapped(linear, shift)
+    torch.testing.assert_close(mapped.points, cloud.points @ linear + shift)
+    torch.testing.assert_close(mapped.cell, cloud.cell @ linear)
+    assert mapped.volume == pytest.approx(cloud.volume * float(torch.linalg.det(linear)), rel=1e-5)
+    assert torch.equal(cloud.points, ImplantPointCloud.from_mesh(trimesh.creation.box((2.0, 3.0, 10.0)), 0.5).points)

@@ -1,6 +1,5 @@
 """Screws that are found in an implant's holes, and their shapes that are estimated along."""
 
-import functools
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from small_scene import GRID_OF_SCREWS, drilled_plate, image, pose
 
 from torchkcreg.implant import Component, ImplantPointCloud, Screw, find_holes
 from torchkcreg.registration import Implant, RegistrationConfig, Stage, build_scene, find_screws, register
-from torchkcreg.scene import RegistrationData, Scene, screw_path
+from torchkcreg.scene import RegistrationData, Scene, ScrewPaths
 from torchkcreg.scene.screw_shapes import ScrewShapes
 
 TRUE = Screw((0.0, 1.5, 15.0), (0.0, -18.0, 15.0), 1.6, "steel")
@@ -118,7 +117,7 @@ def test_screws_are_not_looked_for_where_that_is_not_wanted(mesh: trimesh.Trimes
 
 def test_shapes_are_the_slopes_of_the_images(mesh: trimesh.Trimesh) -> None:
     scene = scene_of(mesh)
-    path = functools.partial(screw_path, scene.assemblies[0], scene.view(image(scene), oversampling=1, margin_mm=6.0))
+    path = ScrewPaths(scene.assemblies[0], scene.view(image(scene), oversampling=1, margin_mm=6.0))
     shapes = ScrewShapes([TRUE], path)
     longer = shapes.added(torch.tensor([[0.4, 0.0]], dtype=torch.float64))["steel"][0]
     (stepped,) = shapes.stepped(torch.tensor([0.4, 0.0], dtype=torch.float64))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -70,6 +71,17 @@ class ImplantPointCloud(nn.Module):
         self._coarser = {}
         super()._apply(fn, recurse)
         return self
+
+    def mapped(self, linear: Tensor, shift: Tensor) -> ImplantPointCloud:
+        """The cloud after ``x -> x linear + shift``, its nodes in the same order; volumes follow the determinant."""
+        other = copy.copy(self)
+        other._buffers = {
+            "points": shift + self.points @ linear,
+            "volumes": self.volumes * torch.linalg.det(linear).abs(),
+            "cell": self.cell @ linear,
+        }
+        other._coarser = {}
+        return other
 
     @classmethod
     def from_mesh(

@@ -105,8 +105,7 @@ class Screw:
         axis = (end - start) / (end - start).norm()
         thicker, longer = self.radius / _COMMON_RADIUS_MM, self.length / _COMMON_LENGTH_MM
         stretch = axis.new_tensor([[thicker], [thicker], [longer]]) * torch.cat([across(axis), axis[None]])
-        volumes = common.volumes * (thicker**2 * longer)
-        return ImplantPointCloud(start + common.points @ stretch, volumes, common.cell @ stretch)
+        return common.mapped(stretch, start)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types under the names of the fields, for files."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.implant import Hole, Screw
-from torchkcreg.scene import Assembly, RegistrationData, Scene, screw_path
+from torchkcreg.scene import Assembly, RegistrationData, Scene, ScrewPaths
 from torchkcreg.similarity import GradientCorrelation
 
 _FIRST_LENGTH_MM = 25.0  # a screw that is there is at least about as long, or it holds nothing
@@ -69,6 +69,7 @@ class _Search:
         self.bare = bare.path_lengths(self.view, state)
         self.physics = bare.arguments(self.view, state)
         self.similarity = GradientCorrelation(self.view.images.line_integrals, self.view.images.mask)
+        self.paths = ScrewPaths(assembly, self.view)
         self.rendered: dict[Screw, Tensor] = {}
 
     def found_of(self, metal: str) -> list[Screw]:
@@ -126,7 +127,7 @@ class _Search:
     def _path(self, screw: Screw) -> Tensor:
         shape = replace(screw, material="", name="")
         if shape not in self.rendered:
-            self.rendered[shape] = screw_path(self.assembly, self.view, shape)
+            self.rendered[shape] = self.paths(shape)
         return self.rendered[shape]
 
 

@@ -5,9 +5,10 @@ from .assembly import Assembly, followed_motion
 from .background import with_background
 from .data import RegistrationData
 from .known_component import KnownComponent
-from .moves import Moves, screw_path
+from .moves import Moves
 from .saved import scene_from_dict, scene_to_dict
 from .scene import Scene
+from .screw_paths import ScrewPaths
 from .state import Placement, State
 from .view import View
 from .view_motions import ViewMotions, ViewMotionSteps
@@ -19,6 +20,7 @@ __all__ = [
     "Placement",
     "RegistrationData",
     "Scene",
+    "ScrewPaths",
     "State",
     "View",
     "ViewMotionSteps",
@@ -26,6 +28,5 @@ __all__ = [
     "followed_motion",
     "scene_from_dict",
     "scene_to_dict",
-    "screw_path",
     "with_background",
 ]

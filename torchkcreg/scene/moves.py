@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchkcreg.deformation import Level, combined
-from torchkcreg.implant import Screw
 from torchkcreg.parameters import ParameterBlock, ParameterBlocks
 
 from .assembly import Assembly
 from .bound_motion import BoundMotion
 from .physics import PhysicsParameters
 from .scene import Scene
+from .screw_paths import ScrewPaths
 from .screw_shapes import ScrewShapes
 from .state import State
 from .tilts import ComponentTilts
 from .view import View
 from .view_motions import ViewMotionSteps
 
-_SCREW_PITCH_MM = 0.5
 _DIFFERENCE_MM = 1e-3
 _NODES_PITCH_MM = 2.0  # distances between candidates need no finer nodes
 _DEVIATIONS_PITCH_MM = 3.0
@@ -164,7 +162,7 @@ class _Part:
 
     def screw_shapes(self, view: View) -> ScrewShapes:
         """How the found screws' lengths and radii change the images of a view."""
-        return ScrewShapes(self.assembly.found, functools.partial(screw_path, self.assembly, view))
+        return ScrewShapes(self.assembly.found, ScrewPaths(self.assembly, view))
 
     def seen_in(self, view: View, nodes: Tensor) -> _Part:
         """The same, with other nodes that are rendered."""
@@ -189,10 +187,3 @@ class _Part:
             still = torch.zeros_like(assembly.tilts)
             shifts = self.tilts.shifts(steps[f"tilts of {self.name}"]) if self.tilts else still
             assembly.place([s.moved(*by) for s, *by in zip(screws, assembly.tilts, shifts, strict=True)])
-
-
-@torch.no_grad()
-def screw_path(assembly: Assembly, view: View, screw: Screw) -> Tensor:
-    """Path lengths (V, rows, cols) in mm of a screw where an assembly now has it."""
-    motion = assembly.motion_at(assembly.implant_to_world.new_tensor(screw.start))
-    return view.cloud_path_lengths(screw.stretched_cloud(_SCREW_PITCH_MM), assembly.implant_to_world @ motion)
