@@ -53,7 +53,7 @@ def screws_by_metal(
     """
     search = _Search(scene, assembly, data, bin)
     found = [search.found_of(metal) for metal in dict.fromkeys([assembly.material, *scene.metals])]
-    return [(screws, search.loss(screws)) for screws in found]
+    return list(zip(found, search.losses(found), strict=True))
 
 
 class _Search:
@@ -86,12 +86,14 @@ class _Search:
                 screws = self.best_of(screws, index, [screw.with_length(length) for length in lengths])
         return screws
 
-    def loss(self, screws: Sequence[Screw]) -> float:
-        paths = self.bare.clone()
-        for screw in screws:
-            paths[:, self.scene.materials.index(screw.material)] += self._path(screw)
+    def losses(self, sets: Sequence[Sequence[Screw]]) -> list[float]:
+        """Of several sets of screws at once."""
+        paths = self.bare.repeat(len(sets), *[1] * (self.bare.dim() - 1))
+        for path, screws in zip(paths, sets, strict=True):
+            for screw in screws:
+                path[self.scene.materials.index(screw.material)] += self._path(screw)
         lines = self.scene.intensity(paths, pooling=self.view.oversampling, **self.physics)
-        return 1.0 - float(self.similarity(lines).mean())
+        return (1.0 - self.similarity(lines).mean(-1)).tolist()
 
     def moved(self, screws: list[Screw], index: int) -> list[Screw]:
         """A screw where it is and with its head in the other parts of a combination hole, tip and direction kept."""
@@ -103,14 +105,14 @@ class _Search:
 
     def grow(self, candidates: list[Screw]) -> list[Screw]:
         chosen: list[Screw] = []
-        without = best = self.loss([])
-        gains = {candidate: torch.inf for candidate in candidates}
+        without, *first = self.losses([[], *([candidate] for candidate in candidates)])
+        best, gains = without, {c: without - loss for c, loss in zip(candidates, first, strict=True)}
         while gains:
             # What a screw gains hardly grows with the others: as long as the one that gained most before still does,
             # the rest need not be tried again.
             tried: dict[Screw, float] = {}
             while (top := max(gains, key=gains.__getitem__)) not in tried:
-                tried[top] = gains[top] = best - self.loss([*chosen, top])
+                tried[top] = gains[top] = best - self.losses([[*chosen, top]])[0]
             if gains[top] < _LEAST_SHARE * without:
                 break
             best, chosen = best - gains[top], [*chosen, top]
@@ -118,11 +120,14 @@ class _Search:
         return chosen
 
     def best_of(self, screws: list[Screw], index: int, variants: list[Screw]) -> list[Screw]:
-        return min([[*screws[:index], variant, *screws[index + 1 :]] for variant in variants], key=self.loss)
+        return self._best([[*screws[:index], variant, *screws[index + 1 :]] for variant in variants])
 
     def best_radius(self, screws: list[Screw], step: float) -> list[Screw]:
-        trials = [[s.with_radius(s.radius * (1 + change)) for s in screws] for change in (-step, 0.0, step)]
-        return min(trials, key=self.loss)
+        return self._best([[s.with_radius(s.radius * (1 + change)) for s in screws] for change in (-step, 0.0, step)])
+
+    def _best(self, sets: list[list[Screw]]) -> list[Screw]:
+        losses = self.losses(sets)
+        return sets[losses.index(min(losses))]
 
     def _path(self, screw: Screw) -> Tensor:
         shape = replace(screw, material="", name="")
