@@ -9,6 +9,8 @@ from torch import Tensor
 
 from .optimizer import Optimizer, Options, Problem
 
+_HOLDS = 24
+_FIRM = 1e-2  # the least damping after a step that led up
 _NEGLIGIBLE = 2e-5  # of the loss
 
 
@@ -52,7 +54,7 @@ class GaussNewton(Optimizer):
             self._damping = max(self._damping / 5, 1e-6) if gain > 0.5 else self._damping * 2
             self._fresh = False
         else:
-            self._damping *= 8
+            self._damping = max(8 * self._damping, _FIRM)
         lost = self._fresh and self._damping > 1e6
         small = size < self.stage.tolerance or (taken and predicted < _NEGLIGIBLE * self._loss)
         self._advance(self._loss, size, end=small or lost)
@@ -92,10 +94,18 @@ class GaussNewton(Optimizer):
         return self.problem.project(trial[None])[0]
 
     def _damped_step(self, curvature: Tensor, gradient: Tensor) -> Tensor:
-        """The Levenberg-Marquardt step, shortened until no parameter moves by more than ``stage.step_mm``."""
+        """The Levenberg-Marquardt step, held until no parameter moves by more than ``stage.step_mm``.
+
+        What holds it is the same for all parameters, which are all worth millimetres: those that the images hardly show
+        are held first, and do not shorten the others' steps.
+        """
         diagonal = curvature.diagonal()
-        floor = 1e-6 * diagonal.mean()
-        step = -torch.linalg.solve(curvature + torch.diag(self._damping * diagonal + floor), gradient)
+        held = 1e-6 * float(diagonal.mean())
+        for _ in range(_HOLDS):
+            step = -torch.linalg.solve(curvature + torch.diag(self._damping * diagonal + held), gradient)
+            if float(step.abs().max()) <= self.stage.step_mm:
+                break
+            held *= 3
         return step * min(1.0, self.stage.step_mm / max(float(step.abs().max()), 1e-12))
 
 

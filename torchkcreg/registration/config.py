@@ -111,13 +111,14 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
     parts, every = ("screws", "tilts"), ("screws", "tilts", *PHYSICS)
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
     fine = {"estimate": every, **seen}
+    coarse = {"iterations": 12}  # what is left then, finer pixels tell better
     after_others = ("background", "reweight")
     weighed = ("weigh",) if deformation in ("fe", "auto") else ()
     hardness = ("scatter", "removed", "hardness")  # coarse pixels do not tell blur
     levels = [
-        Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts),
-        Stage(bin=4, before=("find_screws", "background"), estimate=(*parts, *hardness), **seen),
-        Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen),
+        Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts, **coarse),
+        Stage(bin=4, before=("find_screws", "background"), estimate=(*parts, *hardness), **seen, **coarse),
+        Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen, **coarse),
         Stage(groups=2, bin=2, before=after_others, **fine),
         Stage(**finest, bin=2, before=after_others, **fine),
         Stage(**finest, bin=1, before=("align", *after_others, *weighed), **(fine | {"estimate": (*every, "views")})),
