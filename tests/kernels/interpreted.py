@@ -12,18 +12,18 @@ DEVICE = sys.argv[1]
 if DEVICE == "cpu":
     os.environ["TRITON_INTERPRET"] = "1"
 
-from torchkcreg.geometry import circular_geometry  # noqa: E402
+from torchkcreg.geometry import VolumeGrid, circular_geometry  # noqa: E402
 from torchkcreg.kernels.gpu import KERNELS  # noqa: E402
 from torchkcreg.physics import blur as blur_module  # noqa: E402
 from torchkcreg.physics import transmission as transmission_module  # noqa: E402,F401
-from torchkcreg.projector import cell_footprint, ops  # noqa: E402
+from torchkcreg.projector import cell_footprint, ops, voxel_ops, voxels  # noqa: E402
 from torchkcreg.splines import ControlPointGrid  # noqa: E402
 from torchkcreg.splines import basis as basis_module  # noqa: E402
 from torchkcreg.splines.basis import SplineBasis  # noqa: E402
 
 OPERATORS = {
     operator.name: operator
-    for module in (blur_module, sys.modules["torchkcreg.physics.transmission"], ops, basis_module)
+    for module in (blur_module, sys.modules["torchkcreg.physics.transmission"], ops, voxel_ops, basis_module)
     for operator in vars(module).values()
     if type(operator).__name__ == "Operator"
 }
@@ -85,6 +85,21 @@ def of_splines() -> None:
         compare("spline_evaluate", basis.eta, features, basis._sorted.order, basis._sorted.ends, *orders)
 
 
-for check in (of_points, of_transmission, of_blur, of_splines):
+def of_voxels() -> None:
+    """Steep rays, a tilted detector, a source inside the volume, pixels beside it."""
+    for angles, spacing, shift in (((0, 50, 200), 4.0, 0.0), ((0, 30), 14.0, 380.0)):
+        views = circular_geometry(angles, sad=404, sdd=538, det_shape=(9, 11), pixel_spacing=(spacing, spacing))
+        tilt = torch.tensor([[1.0, 0.05, 0.0], [-0.05, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        middle = (shift, 0.0, 0.3 * shift)
+        grid = VolumeGrid.centered((5, 6, 7), (4.0, 5.0, 6.0), center=middle)
+        rays, step = voxels._rays(grid, (tilt @ views.projection_matrices).to(DEVICE), random(1))
+        volume, images = random(2, 5, 6, 7), random(2, len(angles), 9, 11)
+        compare("voxel_project", volume, rays, step, 9, 11)
+        compare("voxel_backproject", images, rays, step, 5, 6, 7)
+        matrices = (tilt @ views.projection_matrices @ grid.voxel_to_world).to(DEVICE)
+        compare("voxel_backproject_weighted", images, matrices, 5, 6, 7)
+
+
+for check in (of_points, of_transmission, of_blur, of_splines, of_voxels):
     check()
 print("all kernels are their references")

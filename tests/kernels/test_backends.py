@@ -33,7 +33,7 @@ def test_one_more_backend_is_one_line_in_the_table(monkeypatch: pytest.MonkeyPat
     own = Backend("own", frozenset({"cuda"}), lambda: None, operators=frozenset({"twice_for_tests"}))
     monkeypatch.setattr("torchkcreg.kernels.backends.BACKENDS", (own, *BACKENDS))
     assert choose_backend(of_device("cuda"), operator="twice_for_tests") is own
-    assert choose_backend(of_device("cuda"), operator="voxel_project").is_reference
+    assert choose_backend(of_device("cuda"), operator="no_such_kernel").is_reference
     assert choose_backend(of_device("cpu"), operator="twice_for_tests").name == "cpp"
     with pytest.raises(ValueError, match="backend must be one of auto, own, cpp, triton, torch, got 'other'"):
         choose_backend(of_device("cuda"), "other")

@@ -13,7 +13,10 @@ from .backend import Backend
 from .extension import unavailable_reason
 from .operator import Operator
 
-_TRITON = frozenset({"blur", "point_drr", "spline_evaluate", "transmission"})
+_TRITON = frozenset(
+    {"blur", "point_drr", "spline_evaluate", "transmission"}
+    | {"voxel_project", "voxel_backproject", "voxel_backproject_weighted"}
+)
 
 
 @functools.cache

@@ -40,7 +40,8 @@ def project_volume(
         projection_matrices: shape (V, 3, 4), world mm to homogeneous 0-based pixels; any invertible left part, any
             scale. The side of the source on which the grid's centre is counts as the front.
         det_shape: (rows, cols) of the detector.
-        backend: "auto" (C++ on the CPU if it can be had, else torch), "cpp" or "torch". All give the same numbers.
+        backend: "auto" (C++ on a CPU, Triton on a GPU, torch where they cannot be had), or one of them: "cpp",
+            "triton", "torch". All give the same numbers up to rounding.
 
     Returns:
         Images of the volume's dtype, shape (..., V, rows, cols), same bits for every number of threads.
@@ -83,7 +84,7 @@ def backproject(
         projections: images, shape (..., V, rows, cols).
         grid: the voxels to fill.
         projection_matrices: shape (V, 3, 4), as for `project_volume`.
-        backend: "auto", "cpp" or "torch".
+        backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
         Volume of the projections' dtype, shape (..., D, H, W), zero where no ray passes; same bits for every number of
@@ -124,7 +125,7 @@ def backproject_weighted(
         projections: filtered images, shape (..., V, rows, cols).
         grid: the voxels to fill.
         projection_matrices: shape (V, 3, 4), as for `project_volume`.
-        backend: "auto", "cpp" or "torch".
+        backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
         Volume of the projections' dtype, shape (..., D, H, W), same bits for every number of threads.
@@ -152,7 +153,7 @@ class VolumeProjector(nn.Module):
         geometry: anything with ``projection_matrices`` (V, 3, 4) and ``det_shape`` (rows, cols), a
             ``ConeBeamGeometry`` for one. A module moves with this one.
         grid: where the voxels are.
-        backend: "auto", "cpp" or "torch".
+        backend: "auto", "cpp", "triton" or "torch".
 
     >>> from torchkcreg.geometry import circular_geometry
     >>> geometry = circular_geometry(range(0, 360, 6), sad=404, sdd=538, det_shape=(48, 64), pixel_spacing=(2.0, 2.0))

@@ -10,6 +10,7 @@ from .beam import transmission, transmission_backward
 from .filters import blur
 from .points import point_drr, point_drr_backward
 from .splines import spline_evaluate
+from .voxels import voxel_backproject, voxel_backproject_weighted, voxel_project
 
 KERNELS: dict[str, Callable[..., Any]] = {
     "blur": blur,
@@ -18,6 +19,9 @@ KERNELS: dict[str, Callable[..., Any]] = {
     "spline_evaluate": spline_evaluate,
     "transmission": transmission,
     "transmission_backward": transmission_backward,
+    "voxel_project": voxel_project,
+    "voxel_backproject": voxel_backproject,
+    "voxel_backproject_weighted": voxel_backproject_weighted,
 }
 
 __all__ = ["KERNELS"]
