@@ -41,7 +41,6 @@ def simulate(folder: Path) -> None:
 def register(folder: Path, out: Path, views: str, known: bool, threads: int) -> None:
     """One registration in this process; prints what it took as JSON."""
     started = time.perf_counter()
-    import torchkcreg
     from torchkcreg.experiments.inputs import RegistrationFiles
     from torchkcreg.experiments.paper.steps import ViewSets
     from torchkcreg.experiments.register_files import register_files
@@ -59,10 +58,9 @@ def register(folder: Path, out: Path, views: str, known: bool, threads: int) -> 
     )
     result = register_files(files, out, overrides={"material": "steel"})
     taken = {
-        "version": torchkcreg.__version__,
         "import": imported,
         "whole": time.perf_counter() - started,
-        "stages": [stage.seconds for stage in result.stages],
+        "stages": list({record["stage"]: record["seconds"] for record in result.history}.values()),
         "gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
     }
     print(json.dumps(taken))

@@ -92,6 +92,20 @@ def test_kcrec_takes_implant_and_files_from_the_run(small_run, tmp_path):
     assert metrics["components"].count("steel") > 1 and metrics["passes"] == 2
 
 
+def test_kcmar_is_an_fdk_around_the_registered_metal(ball_scan, small_run, tmp_path, capsys):
+    flags = ("--method", "kcmar", "--no-figures")
+    assert main(arguments(ball_scan, tmp_path / "around", *flags, "--run", small_run)) == 0
+    background, grid = read_volume(tmp_path / "around" / "volume.mha")
+    whole, _ = read_volume(tmp_path / "around" / "with_implant.mha")
+    inside = grid.points().norm(dim=-1) < 14
+    assert 0.014 < float(background[inside].mean()) < 0.02  # behind a plate as wide as the ball little is left of it
+    assert whole.max() > 3 * background.max()
+    metrics = json.loads((tmp_path / "around" / "metrics.json").read_text())
+    assert metrics["components"].count("steel") > 1 and metrics["passes"] is None
+    assert main(arguments(ball_scan, tmp_path / "other", *flags)) == 2
+    assert "method kcmar needs the run of a registration" in capsys.readouterr().err
+
+
 def test_the_registered_metal_has_the_volume_of_its_meshes(small_run, small_case):
     components = registered_components(small_run)
     assert len(components) == 7  # a plate and six screws

@@ -124,8 +124,10 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _add_reconstruct(commands) -> None:
-    command = add_command(commands, "reconstruct", _reconstruct, "make a volume from a scan: FDK, PWLS or KC-Rec")
-    command.add_argument("--method", choices=("fdk", "pwls", "kcrec"), default="fdk", help="default: fdk")
+    command = add_command(
+        commands, "reconstruct", _reconstruct, "make a volume from a scan: FDK, PWLS, KC-MAR or KC-Rec"
+    )
+    command.add_argument("--method", choices=("fdk", "pwls", "kcmar", "kcrec"), default="fdk", help="default: fdk")
     command.add_argument("--run", type=Path, dest="run_folder", help="registration: the implant, and files not given")
     command.add_argument("--geometry", type=Path, help="projection matrices of all views (JSON)")
     command.add_argument("--projections", type=Path, help="intensities or line integrals of all views (NPZ, MHA)")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +20,10 @@ from torchkcreg.reconstruction import (
     PWLSConfig,
     Veil,
     ViewShard,
+    component_path_lengths,
     fdk,
     hounsfield,
+    inpainted,
     known_materials,
     path_lengths_through,
     prepare,
@@ -33,6 +32,7 @@ from torchkcreg.reconstruction import (
 )
 from torchkcreg.visualization import reconstruction_figure
 
+from .processes import processes
 from .reconstruction_inputs import (
     ReconstructionFiles,
     ReconstructionInputs,
@@ -85,7 +85,7 @@ def reconstruct_files(
     """
     start = time.perf_counter()
     inputs = read_reconstruction_inputs(files, options)
-    with _processes() as rank:
+    with processes() as rank:
         shard = ViewShard.of(inputs.geometry.num_views) if distributed.is_initialized() else None
         record = _record(files, options)
         run = _folder(out, record, overwrite=overwrite, resume=resume) if rank == 0 else None
@@ -106,7 +106,7 @@ def _reconstructed(
     state: dict[str, Any] | None,
 ) -> tuple[Tensor, list[dict[str, Any]]]:
     geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
-    if options.method == "fdk":
+    if options.is_filtered:
         ramp = FDKConfig(window=options.window)
         return fdk(_line_integrals(inputs, options), geometry, grid, config=ramp, shard=shard, backend=backend), []
     changes = {name: getattr(options, name) for name in ("iterations", "subsets") if getattr(options, name) is not None}
@@ -139,11 +139,16 @@ def _reconstructed(
 
 
 def _line_integrals(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Tensor:
-    """What FDK takes: line integrals, or path lengths where the object is of one material alone."""
+    """What FDK takes: line integrals, around known metal, or path lengths where the object is of one material alone."""
     alone = options.single_material
-    beam = inputs.beam if alone is None else BeamModel.monoenergetic([])
+    beam = inputs.beam.without_metals() if alone is None else BeamModel.monoenergetic([])
     lines = prepare(inputs.transmission, inputs.geometry, beam, scatter=inputs.scatter, mask=inputs.mask).line_integrals
-    return lines if alone is None else path_lengths_through(torch.exp(-lines), material(alone), inputs.spectrum)
+    if alone is not None:
+        return path_lengths_through(torch.exp(-lines), material(alone), inputs.spectrum)
+    if not inputs.components:
+        return lines
+    metal = component_path_lengths(inputs.components, inputs.geometry, backend=options.backend)
+    return inpainted(lines, metal, mask=inputs.mask)
 
 
 class _Checkpoints(Callback):
@@ -174,7 +179,7 @@ def _metrics(
         "water": beam.water,
         "scatter": _scatter_in_words(inputs.scatter),
         "components": [component.material for component in inputs.components],
-        "passes": None if options.method == "fdk" else options.num_passes,
+        "passes": None if options.is_filtered else options.num_passes,
         "history": history,
         "seconds": seconds,
     }
@@ -240,19 +245,3 @@ def _folder(out: Path, record: dict[str, Any], *, overwrite: bool, resume: bool)
         (run.path / name).unlink(missing_ok=True)
     run.start(record)
     return run
-
-
-@contextmanager
-def _processes() -> Iterator[int]:
-    """The rank of this process; torch.distributed runs inside where ``torchrun`` started several."""
-    if int(os.environ.get("WORLD_SIZE", "1")) < 2:
-        yield 0
-        return
-    started = not distributed.is_initialized()
-    if started:
-        distributed.init_process_group("gloo")
-    try:
-        yield distributed.get_rank()
-    finally:
-        if started:
-            distributed.destroy_process_group()

@@ -76,7 +76,7 @@ class ReconstructionOptions(Config):
         backend: Projector: "auto", "cpp" or "torch".
     """
 
-    method: Literal["fdk", "pwls", "kcrec"] = "fdk"
+    method: Literal["fdk", "pwls", "kcrec", "kcmar"] = "fdk"
     spacing_mm: float = Field(0.8, gt=0)
     size_mm: tuple[float, float, float] | None = None
     center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -92,6 +92,11 @@ class ReconstructionOptions(Config):
     material: str | None = None
     single_material: str | None = None
     backend: Literal["auto", "cpp", "torch"] = "auto"
+
+    @property
+    def is_filtered(self) -> bool:
+        """Whether it is a filtered back-projection, without iterations."""
+        return self.method in ("fdk", "kcmar")
 
     @property
     def num_passes(self) -> int:
@@ -113,7 +118,7 @@ class ReconstructionInputs:
         beam: Energies and the metals' attenuation.
         scatter: Smooth scatter, or an image of it in units of the open beam; None for none.
         spectrum: As detected; a likely one where no file says it.
-        components: The metal in its place; none but for "kcrec".
+        components: The metal in its place; none but for "kcrec" and "kcmar".
     """
 
     geometry: ConeBeamGeometry
@@ -140,9 +145,9 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     projections = read_projections(files.projections, open_beam=files.open_beam)
     projections.check_against(geometry)
     components = []
-    if options.method == "kcrec":
+    if options.method in ("kcrec", "kcmar"):
         if files.run is None:
-            raise ValueError("method kcrec needs the run of a registration: name it with --run")
+            raise ValueError(f"method {options.method} needs the run of a registration: name it with --run")
         components = registered_components(files.run, components=files.components, material=options.material)
     spectrum = read_spectrum(files.spectrum) if files.spectrum is not None else None
     if options.single_material is not None:

@@ -1,7 +1,8 @@
 """Reconstruction: filtered back-projection, penalised weighted least squares, known components.
 
 `fdk` for one or several focal spots; `pwls` with ordered subsets and momentum; `prepare` turns measured transmissions
-into line integrals and weights, with known components (KC-Rec), scatter and beam hardening accounted for.
+into line integrals and weights, with known components (KC-Rec), scatter and beam hardening accounted for; `inpainted`
+is the fast way around known metal (KC-MAR).
 """
 
 from torchkcreg.physics import Veil, veil_image
@@ -12,6 +13,7 @@ from .ct_numbers import hounsfield
 from .dead_pixels import filled
 from .fdk import FDKConfig, fdk
 from .field_of_view import coverage, field_of_view_grid
+from .inpainting import inpainted
 from .known_component import (
     component_path_lengths,
     component_shares,
@@ -57,6 +59,7 @@ __all__ = [
     "fit_veil",
     "floored_line_integrals",
     "hounsfield",
+    "inpainted",
     "known_materials",
     "mineral_part",
     "ordered_subsets",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -101,6 +101,11 @@ class BeamModel:
         one = torch.ones(1, dtype=torch.float64)
         table = torch.tensor(list(attenuation), dtype=torch.float64).reshape(-1, 1)
         return cls(Beam(torch.zeros_like(one), one, table), one, one, None, water)
+
+    def without_metals(self) -> BeamModel:
+        """The same beam where there is no metal in it."""
+        beam = self.beam
+        return replace(self, beam=Beam(beam.energies_kev, beam.weights, beam.attenuation[:0]))
 
 
 def behind_metal(path_lengths: Tensor, beam: BeamModel, *, pooling: int = 1, blur_sigma_px: float = 0.0) -> Tensor:
