@@ -146,6 +146,20 @@ def test_the_command_refuses_what_is_no_study_case_or_option(tmp_path, capsys):
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "asked", "told"),
+    [
+        ("loads", {"elastic": True, "images": "mirrored"}, "the study loads has its own elastic and images"),
+        ("views", {"views": "around"}, "the study views has its own views"),
+        ("coverage", {"views": "both"}, "the study coverage has its own views"),
+    ],
+)
+def test_an_option_that_would_change_nothing_is_refused(name, asked, told, tmp_path):
+    with pytest.raises(ValueError, match=told):
+        run_study(name, StudyOptions(cases=1, **asked), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_command_knows_every_study_and_no_other(tmp_path, capsys):
     for name in STUDIES:
         assert main(["study", name, "--cases=0", f"--out={tmp_path}"]) == 2

@@ -66,12 +66,20 @@ class Study:
         jobs: Of options.
         function: Runs one.
         report: What all rows say; writes table and figures to a folder.
+        fixed: Names of options that the study sets itself, or has no use for.
     """
 
     text: str
     jobs: Callable[[StudyOptions], list[Job]]
     function: Callable[[Job], Row]
     report: Callable[[Sequence[Row], Path], str]
+    fixed: tuple[str, ...] = ()
+
+    def check(self, name: str, options: StudyOptions) -> None:
+        """Raises ValueError if options ask for what the study, of this name, would not do."""
+        usual = StudyOptions()
+        if asked := [option for option in self.fixed if getattr(options, option) != getattr(usual, option)]:
+            raise ValueError(f"the study {name} has its own {' and '.join(asked)}: none can be chosen")
 
 
 def run_study(
@@ -89,11 +97,12 @@ def run_study(
         cluster: See :func:`sweep`.
 
     Raises:
-        ValueError: If there is no such study or no case, or the rows of all jobs are errors.
+        ValueError: If there is no such study or case, an option has no use in it, or the rows of all jobs are errors.
     """
     if name not in STUDIES:
         raise ValueError(f"there is no study {name!r}: there are {', '.join(STUDIES)}")
     study = STUDIES[name]
+    study.check(name, options)
     jobs = study.jobs(options)
     if not jobs:
         raise ValueError(f"a study needs a case or more, got {options.cases}")
@@ -165,8 +174,14 @@ def _loads(options: StudyOptions) -> list[Job]:
 
 STUDIES = {
     "population": Study("errors and verdicts of randomly drawn cases", _population, simulated, of_population),
-    "coverage": Study("how often error bars hold the truth", _coverage, covered, of_coverage),
+    "coverage": Study("how often error bars hold the truth", _coverage, covered, of_coverage, ("views",)),
     "geometry": Study("what a geometry that is off costs, and what is won back", _geometry, corrected, of_geometry),
-    "loads": Study("loads in newton, views and noise, on the tibial plate", _loads, registered_load, of_loads),
-    "views": Study("whether planned views beat random ones", _views, planned, of_views),
+    "loads": Study(
+        "loads in newton, views and noise, on the tibial plate",
+        _loads,
+        registered_load,
+        of_loads,
+        ("views", "elastic", "images", "cache"),
+    ),
+    "views": Study("whether planned views beat random ones", _views, planned, of_views, ("views",)),
 }
