@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -61,9 +60,15 @@ def register(folder: Path, out: Path, views: str, known: bool, threads: int) -> 
         "import": imported,
         "whole": time.perf_counter() - started,
         "stages": list({record["stage"]: record["seconds"] for record in result.history}.values()),
-        "gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "gib": peak_gib(),
     }
     print(json.dumps(taken))
+
+
+def peak_gib() -> float:
+    """Of this process since it was started; `getrusage` would count what it was forked from."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 2**20
 
 
 def table(rows: dict[str, list[dict]], threads: int) -> str:
