@@ -10,6 +10,7 @@ from small_scene import RIGID, image, plate, scene
 
 from torchkcreg.io import RunFolder, read_run
 from torchkcreg.registration import RegistrationConfig, RegistrationResult, Stage, register
+from torchkcreg.registration.stage_run import StageRun
 from torchkcreg.scene import RegistrationData, ViewMotions, ViewMotionSteps
 from torchkcreg.similarity import GradientDifference
 
@@ -128,3 +129,20 @@ def test_motions_of_other_views_are_refused(data) -> None:
     with pytest.raises(ValueError, match="motions of 3 views do not fit a geometry of 2"):
         here.view(data.select([0, 1]))
     assert here(data.geometry.select([0, 1])).shape[0] == 2  # a geometry alone is taken as it is
+
+
+def test_derivatives_to_the_views_are_taken_of_all_views_at_once(data) -> None:
+    off, motions = moved(data)
+    here = scene(CONFIG)
+    here.view_motions = motions
+    run = StageRun(here, off, ALIGNED, CONFIG)
+    at = 0.02 * torch.randn(run.objective.num_parameters, generator=torch.Generator().manual_seed(0)).double()
+    at[: run.objective.moves.places["views"].start] = 0
+    jacobian, residuals = run.objective.jacobian(at)
+    places = run.objective.moves.places["views"]
+    assert places.stop - places.start == 6 * off.num_views
+    for number in (places.start, places.start + 8, places.stop - 1, 0):
+        step = torch.zeros_like(at)
+        step[number] = 0.01
+        slope = (run.objective._residuals((at + step)[None])[0] - residuals) / 0.01
+        torch.testing.assert_close(jacobian[number], slope, atol=2e-2 * float(slope.abs().max()), rtol=0)

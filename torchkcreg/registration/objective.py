@@ -130,8 +130,24 @@ class Objective:
         """Derivatives (D, V, 2, rows, cols) of the residual images, and those (V, 2, rows, cols)."""
         offsets = step_mm * torch.eye(self.num_parameters, dtype=parameters.dtype, device=parameters.device)
         center = self._residuals(parameters[None])
-        steps = [(self._residuals(parameters + o) - center) / step_mm for o in offsets.split(self._batch())]
-        return torch.cat(steps), center[0]
+        own = self.moves.places.get("views")
+        if own is None:
+            return self._slopes(parameters, offsets, center, step_mm), center[0]
+        # a view's motion moves its own image alone: those of all views are tried at once
+        views = self.images.num_views
+        together = offsets[own].unflatten(0, (views, -1)).sum(0)
+        found = center.new_zeros(self.num_parameters, *center.shape[1:])
+        found[: own.start] = self._slopes(parameters, offsets[: own.start], center, step_mm)
+        found[own.stop :] = self._slopes(parameters, offsets[own.stop :], center, step_mm)
+        of_views = self._slopes(parameters, together, center, step_mm)
+        for view, block in enumerate(found[own].unflatten(0, (views, -1))):
+            block[:, view] = of_views[:, view]
+        return found, center[0]
+
+    def _slopes(self, parameters: Tensor, offsets: Tensor, center: Tensor, step_mm: float) -> Tensor:
+        """How the residual images (1, V, ...) change with offsets (K, D), for each of their units: (K, V, ...)."""
+        batches = offsets.split(self._batch()) if len(offsets) else ()
+        return torch.cat([center[:0], *((self._residuals(parameters + o) - center) / step_mm for o in batches)])
 
     def uncertainty(self, parameters: Tensor) -> Uncertainty:
         """How sure the images are of parameters (D,) near the optimum."""

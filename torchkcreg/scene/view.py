@@ -163,17 +163,19 @@ class View:
 
     def _drawn(self, body: _Body, points: Tensor, views: Tensor | None) -> Tensor:
         """Path lengths (K, V, rows, cols) of a body at points (K, N, 3)."""
-        if views is not None:  # what moves otherwise in every view is projected view by view
-            alone = [
-                self._projected(body, transform_points(motion.to(points), points), slice(view, view + 1))
-                for view, motion in enumerate(views.unbind(1))
-            ]
-            return torch.cat(alone, dim=1)
-        return self._projected(body, points, slice(None))
+        if views is None:
+            return self._projected(body, points, slice(None))
+        if not views.requires_grad and bool((views == views[:1]).all()):  # the same for all candidates
+            return self._projected(body, points, slice(None), self.matrices @ views[0].to(self.matrices))
+        alone = [  # what moves otherwise in every view is projected view by view
+            self._projected(body, transform_points(motion.to(points), points), slice(view, view + 1))
+            for view, motion in enumerate(views.unbind(1))
+        ]
+        return torch.cat(alone, dim=1)
 
-    def _projected(self, body: _Body, points: Tensor, views: slice) -> Tensor:
+    def _projected(self, body: _Body, points: Tensor, views: slice, matrices: Tensor | None = None) -> Tensor:
         footprint = Footprint(body.footprint.table[views], body.footprint.block_size)
-        matrices, shape = self.matrices[views], self.fine.det_shape
+        matrices, shape = self.matrices[views] if matrices is None else matrices, self.fine.det_shape
         return project_points(points, body.volumes, matrices, shape, footprint=footprint, backend=self.backend)
 
     def cloud_path_lengths(self, cloud: ImplantPointCloud, motion: Tensor) -> Tensor:
