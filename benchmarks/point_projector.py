@@ -221,7 +221,22 @@ def growth(scene: Scene, rounds: int) -> list[tuple[str, int, float]]:
     return rows
 
 
-def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: list[str]) -> str:
+def roofline(scene: Scene, rate: float, rounds: int) -> str:
+    """What so many million node-views a second are of the floating-point rate that a matrix product reaches."""
+    geometry, cloud = scene.geometry, scene.cloud
+    taps = cell_footprint(cloud.points, cloud.cell, geometry.projection_matrices).taps
+    operations = 2 * (4 * taps**2 + 12) + taps**2  # four corners of the table a tap; the projection; the image
+    size = 2048
+    left, right = torch.rand(2, size, size)
+    best = 2 * size**3 / best_times({0: lambda: left @ right}, rounds)[0] / 1e9
+    found = rate * operations / 1e3
+    return (
+        f"A node-view has {taps} x {taps} taps, {operations} floating-point operations: {found:.0f} GFLOP/s, "
+        f"{100 * found / best:.0f} % of the {best:.0f} GFLOP/s of a product of {size} x {size} matrices."
+    )
+
+
+def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: list[str], limit: str) -> str:
     modules = dict.fromkeys(module for name, (_, module) in LIBRARIES.items() if name in names)
     versions = [f"{module} {metadata.version(module)}" for module in ("torch", *modules) if module != "torchkcreg"]
     times = {(step, name, threads): seconds for step, name, threads, seconds, _ in rows}
@@ -246,6 +261,8 @@ def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: lis
         "| what grows | to | million node-views a second |",
         "| --- | --- | --- |",
         *(f"| {what} | {number} | {rate:.0f} |" for what, number, rate in grown),
+        "",
+        limit,
         "",
     ]
     return "\n".join(lines)
@@ -286,7 +303,9 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{name} is not installed and left out")
     scene = Scene(options.binning)
     rows = [row for threads in options.threads for row in measure(scene, threads, options.rounds, names)]
-    text = table(scene, rows, growth(scene, options.rounds), names, left_out)
+    grown = growth(scene, options.rounds)
+    limit = roofline(scene, grown[-1][2], options.rounds)
+    text = table(scene, rows, grown, names, left_out, limit)
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "point_projector.md").write_text(text)

@@ -100,13 +100,14 @@ TORCHKCREG_BY_PROCESSOR(float, spline_run, (const SplineRun<float>& run), (run))
 TORCHKCREG_BY_PROCESSOR(double, spline_run, (const SplineRun<double>& run), (run))
 
 template <typename scalar_t>
-void evaluate(const Tensor& eta, const Tensor& features, const Tensor& order, const Tensor& ends, const int (&orders)[3],
-              Tensor& result) {
+void evaluate(const Tensor& eta, const Tensor& features, const Tensor& order, const Tensor& ends,
+              const int (&orders)[3], Tensor& result) {
   const int64_t* points = order.const_data_ptr<int64_t>();
   const int64_t *first = ends.const_data_ptr<int64_t>(), *last = first + ends.size(0);
   const int64_t values = features.size(2);
-  SplineRun<scalar_t> all{eta.const_data_ptr<scalar_t>(), nullptr, nullptr, 0, values, {orders[0], orders[1], orders[2]},
-                          result.mutable_data_ptr<scalar_t>()};
+  SplineRun<scalar_t> all{
+      eta.const_data_ptr<scalar_t>(),     nullptr, nullptr, 0, values, {orders[0], orders[1], orders[2]},
+      result.mutable_data_ptr<scalar_t>()};
   torch::stable::parallel_for(0, order.size(0), kPointsOfTask, [&](int64_t begin, int64_t end) {
     SplineRun<scalar_t> run = all;
     while (begin < end) {
