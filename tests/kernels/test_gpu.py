@@ -25,7 +25,7 @@ def test_every_kernel_is_its_reference_under_the_interpreter() -> None:
     assert run("interpreted.py", "cpu").endswith("all kernels are their references\n")
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no such device here: a GPU")
 def test_every_kernel_is_its_reference_on_a_gpu() -> None:
     assert run("interpreted.py", "cuda").endswith("all kernels are their references\n")
 

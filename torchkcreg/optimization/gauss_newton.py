@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .optimizer import Optimizer, Options, Problem
 
-_HOLDS = 24
+_HOLDS = 24  # how often what holds a step may be tripled
 _FIRM = 1e-2  # the least damping after a step that led up
 _NEGLIGIBLE = 2e-5  # of the loss
 
@@ -17,8 +17,9 @@ _NEGLIGIBLE = 2e-5  # of the loss
 class GaussNewton(Optimizer):
     """Gauss-Newton with Levenberg-Marquardt damping (Marquardt 1963) and steps of at most ``stage.step_mm``.
 
-    The gradient is exact; the curvature is taken once and again when steps stop agreeing with it. It also ends with a
-    step that is taken and promised next to nothing: it moved what the images hardly show by micrometres.
+    The gradient is exact; the curvature is taken once, learns from every step that is taken, and is taken again when
+    steps stop agreeing with it. It also ends with a step that is taken and promised next to nothing: it moved what the
+    images hardly show by micrometres.
     """
 
     _KEPT: ClassVar[tuple[str, ...]] = ("_parameters", "_loss", "_gradient", "_curvature", "_fresh", "_damping")
