@@ -27,21 +27,29 @@ def installed(module: str) -> bool:
         return False
 
 
-def best_times(steps: Mapping[Any, Callable[[], Any]], rounds: int) -> dict[Any, float]:
-    """Seconds of the best of some rounds, in which all steps take turns, after one to warm up.
+def present(modules: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """Names of libraries whose modules are installed, and of those that are left out, with a word."""
+    left_out = [name for name, module in modules.items() if not installed(module)]
+    for name in left_out:
+        print(f"{name} is not installed and left out")
+    return [name for name in modules if name not in left_out], left_out
+
+
+def timed(steps: Mapping[Any, Callable[[], Any]], rounds: int) -> tuple[dict[Any, float], dict[Any, Any]]:
+    """Seconds of the best of some rounds, in which all steps take turns, after one to warm up; what that one gave.
 
     What takes more than `_SLOW` seconds is called once alone: warming up is nothing against that.
     """
-    best = {key: _seconds(run) for key, run in steps.items()}
+    best, results = {}, {}
+    for key, run in steps.items():
+        start = time.perf_counter()
+        results[key] = run()
+        best[key] = time.perf_counter() - start
     quick = {key: run for key, run in steps.items() if best[key] < _SLOW}
     best |= dict.fromkeys(quick, float("inf"))
     for _ in range(rounds):
         for key, run in quick.items():
-            best[key] = min(best[key], _seconds(run))
-    return best
-
-
-def _seconds(run: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
+            start = time.perf_counter()
+            run()
+            best[key] = min(best[key], time.perf_counter() - start)
+    return best, results

@@ -19,7 +19,7 @@ from importlib import metadata
 from pathlib import Path
 
 import torch
-from common import best_times, installed, processor
+from common import present, processor, timed
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -181,16 +181,8 @@ def measure(scene: Scene, threads: int, rounds: int, names: list[str]) -> list[t
     """Rows (step, library, threads, best seconds, error in per cent)."""
     torch.set_num_threads(threads)
     made = {name: LIBRARIES[name][0](scene) for name in names}
-    found: dict[str, Tensor] = {}
-
-    def keeping(name: str, step: str) -> Callable[[], None]:
-        def run() -> None:
-            found[name + step] = made[name][step]()
-
-        return run
-
-    times = best_times({(name, step): keeping(name, step) for name in names for step in made[name]}, rounds)
-    errors = {name: scene.error(found[f"{name}forward"]) for name in names}
+    times, found = timed({(name, step): run for name, steps in made.items() for step, run in steps.items()}, rounds)
+    errors = {name: scene.error(found[name, "forward"]) for name in names}
     return [(step, name, threads, seconds, errors[name]) for (name, step), seconds in times.items()]
 
 
@@ -201,7 +193,7 @@ def growth(scene: Scene, rounds: int) -> list[tuple[str, int, float]]:
 
     def rate(points: Tensor, nodes: Tensor, geometry: ConeBeamGeometry, cell: Tensor) -> float:
         projector, footprint = PointCloudProjector(geometry), cell_footprint(points, cell, geometry.projection_matrices)
-        seconds = best_times({0: lambda: projector(points, nodes, footprint=footprint)}, rounds)[0]
+        seconds = timed({0: lambda: projector(points, nodes, footprint=footprint)}, rounds)[0][0]
         return points.shape[:-1].numel() * len(geometry.projection_matrices) / seconds / 1e6
 
     for factor in (4, 3, 2, 1):
@@ -228,7 +220,7 @@ def roofline(scene: Scene, rate: float, rounds: int) -> str:
     operations = 2 * (4 * taps**2 + 12) + taps**2  # four corners of the table a tap; the projection; the image
     size = 2048
     left, right = torch.rand(2, size, size)
-    best = 2 * size**3 / best_times({0: lambda: left @ right}, rounds)[0] / 1e9
+    best = 2 * size**3 / timed({0: lambda: left @ right}, rounds)[0][0] / 1e9
     found = rate * operations / 1e3
     return (
         f"A node-view has {taps} x {taps} taps, {operations} floating-point operations: {found:.0f} GFLOP/s, "
@@ -297,10 +289,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--binning", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args(arguments)
-    left_out = [name for name, (_, module) in LIBRARIES.items() if not installed(module)]
-    names = [name for name in LIBRARIES if name not in left_out]
-    for name in left_out:
-        print(f"{name} is not installed and left out")
+    names, left_out = present({name: module for name, (_, module) in LIBRARIES.items()})
     scene = Scene(options.binning)
     rows = [row for threads in options.threads for row in measure(scene, threads, options.rounds, names)]
     grown = growth(scene, options.rounds)

@@ -12,14 +12,13 @@ Writes voxel_projector.md and voxel_projector.png.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import torch
-from common import installed, processor
+from common import present, processor, timed
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
@@ -180,17 +179,10 @@ def measure(threads: int, rounds: int, names: list[str]) -> list[tuple[str, str,
     made = {name: LIBRARIES[name](geometry, volume, images, threads) for name in names}
     leaning = ours(tilted(geometry), volume, images, threads)
     made["torchkcreg, tilted"] = {name: leaning[name] for name in ("forward", "back")}
-    results = {(name, step): run() for name, steps in made.items() for step, run in steps.items()}  # warms up too
-    best = {key: float("inf") for key in results}
-    for _ in range(rounds):
-        for step in ("forward", "back", "FDK"):
-            for name in made:
-                if step in made[name]:
-                    start = time.perf_counter()
-                    made[name][step]()
-                    best[name, step] = min(best[name, step], time.perf_counter() - start)
+    order = ("forward", "back", "FDK")
+    best, results = timed({(n, step): made[n][step] for step in order for n in made if step in made[n]}, rounds)
     rows = []
-    for step in ("forward", "back", "FDK"):
+    for step in order:
         for name in made:
             if (name, step) in results:
                 truth = chords(tilted(geometry)) if "tilted" in name else images
@@ -258,10 +250,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args(arguments)
     modules = {"itk-rtk": "itk.RTKPython", "mbirtorch": "mbirtorch", "torchkcreg": "torchkcreg"}
-    left_out = [name for name in LIBRARIES if not installed(modules[name])]
-    names = [name for name in LIBRARIES if name not in left_out]
-    for name in left_out:
-        print(f"{name} is not installed and left out")
+    names, left_out = present({name: modules[name] for name in LIBRARIES})
     rows = [row for threads in options.threads for row in measure(threads, options.rounds, names)]
     text = table(rows, names, left_out)
     print(text)

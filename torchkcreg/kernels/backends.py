@@ -14,8 +14,15 @@ from .extension import unavailable_reason
 from .operator import Operator
 
 _TRITON = frozenset(
-    {"blur", "point_drr", "spline_evaluate", "transmission"}
-    | {"voxel_project", "voxel_backproject", "voxel_backproject_weighted"}
+    (
+        "blur",
+        "point_drr",
+        "spline_evaluate",
+        "transmission",
+        "voxel_project",
+        "voxel_backproject",
+        "voxel_backproject_weighted",
+    )
 )
 
 

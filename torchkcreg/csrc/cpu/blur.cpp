@@ -30,7 +30,6 @@ class Filter {
     std::reverse(flipped_.begin(), flipped_.end());
   }
 
-  int64_t taps() const { return taps_; }
   int64_t radius() const { return radius_; }
 
   // Lines that make output line i of n: their numbers are first, first + 1, ...; returns how many.
