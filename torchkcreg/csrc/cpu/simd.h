@@ -32,6 +32,7 @@ struct Simd {
   static TORCHKCREG_INLINE V smaller(V a, V b) { return a < b ? a : b; }
   static TORCHKCREG_INLINE V larger(V a, V b) { return a > b ? a : b; }
   static TORCHKCREG_INLINE int_t lane(I x, int l) { return x[l]; }
+  static TORCHKCREG_INLINE scalar_t lane(V x, int l) { return x[l]; }
   // 0, 1, 2, ...
   static TORCHKCREG_INLINE V ramp() {
     V x;
@@ -54,6 +55,17 @@ struct Simd {
 #endif
     return gather(table, i);
   }
+  // Between table[i] and table[i + 1], likewise, where reach is below 2 L.
+  static TORCHKCREG_INLINE V between_near(const scalar_t* table, I i, V fraction, int64_t first) {
+#ifndef __clang__
+    const V low = load(table + first), high = load(table + first + L);
+    const I j = i - static_cast<int_t>(first);
+    const V a = __builtin_shuffle(low, high, j), b = __builtin_shuffle(low, high, j + 1);
+#else
+    const V a = gather(table, i), b = gather(table + 1, i);
+#endif
+    return a + fraction * (b - a);
+  }
   static TORCHKCREG_INLINE V gather(const scalar_t* table, I i) {
     V x;
     for (int l = 0; l < L; ++l) x[l] = table[i[l]];
@@ -73,12 +85,24 @@ struct Simd {
   static TORCHKCREG_INLINE V smaller(V a, V b) { return a < b ? a : b; }
   static TORCHKCREG_INLINE V larger(V a, V b) { return a > b ? a : b; }
   static TORCHKCREG_INLINE int_t lane(I x, int) { return x; }
+  static TORCHKCREG_INLINE scalar_t lane(V x, int) { return x; }
   static TORCHKCREG_INLINE V ramp() { return 0; }
   static TORCHKCREG_INLINE V lookup(const scalar_t* table, I i, int64_t, int64_t) { return table[i]; }
+  static TORCHKCREG_INLINE V between_near(const scalar_t* table, I i, V fraction, int64_t) {
+    return table[i] + fraction * (table[i + 1] - table[i]);
+  }
   static TORCHKCREG_INLINE V gather(const scalar_t* table, I i) { return table[i]; }
   static constexpr int64_t kReadAhead = 4;
 #endif
 };
+
+TORCHKCREG_INLINE void prefetch(const void* from) {
+#ifdef TORCHKCREG_LANES
+  __builtin_prefetch(from);
+#else
+  (void)from;
+#endif
+}
 
 constexpr int64_t kMaxReadAhead = 64;  // of every vector below
 

@@ -93,7 +93,6 @@ TORCHKCREG_INLINE void add_energies(const TransmissionShape& p, const Transmissi
 // y += scale x
 template <typename scalar_t, int L>
 TORCHKCREG_INLINE void add_scaled(scalar_t* y, const scalar_t* x, scalar_t scale, int64_t count) {
-  using S = Simd<scalar_t, L>;
   over_pixels<L>(count, [&](int64_t i, int64_t lanes) {
     store_some<scalar_t, L>(y + i, load_some<scalar_t, L>(y + i, lanes) + load_some<scalar_t, L>(x + i, lanes) * scale,
                             lanes);

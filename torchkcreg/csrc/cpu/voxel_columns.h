@@ -53,9 +53,14 @@ TORCHKCREG_INLINE void add_resampled(const scalar_t* TORCHKCREG_RESTRICT column,
     const typename S::I below = S::truncate(position);
     const typename S::V fraction = position - S::number(below);
     const int64_t first = S::lane(below, 0);
-    const typename S::V a = S::lookup(before, below, first, reach);
-    const typename S::V b = S::lookup(before + 1, below, first, reach);
-    S::store(sums + n, S::load(sums + n) + (a + fraction * (b - a)));
+    typename S::V value;
+    if (reach < 2 * L) {
+      value = S::between_near(before, below, fraction, first);
+    } else {
+      const typename S::V a = S::lookup(before, below, first, reach);
+      value = a + fraction * (S::lookup(before + 1, below, first, reach) - a);
+    }
+    S::store(sums + n, S::load(sums + n) + value);
   }
 }
 

@@ -1,27 +1,32 @@
-// CPU kernel of the voxel projector. A task is a block of detector columns of a view, and its pixels are its own, so
-// sums don't depend on the number of threads.
+// CPU kernel of the voxel projector. A task is a block of detector columns (or rows) of a view, and its pixels are its
+// own, so sums don't depend on the number of threads.
 //
 // Where detector columns are parallel to z, a whole column of rays crosses each plane between the same two columns of
-// voxels: these are blended, and the blend is sampled at equal steps. Other rays go one by one, some abreast.
+// voxels: these are blended, and the blend is sampled at equal steps. Elsewhere the rays of a line go some abreast.
 
 #include <torch/csrc/stable/library.h>
 
 #include "voxel_columns.h"
 #include "voxel_lattice.h"
+#include "voxel_line.h"
 #include "voxel_problem.h"
 
 namespace torchkcreg {
 namespace {
 
-constexpr int64_t kBlockCols = 16;
+constexpr int64_t kBlockLines = 16;
 
 template <typename scalar_t>
 struct ProjectScratch {
-  std::vector<scalar_t> column, sums;
+  std::vector<scalar_t> column, sums, along;
+  RayLine<scalar_t> line;
 
   explicit ProjectScratch(const VoxelProblem& p)
-      : column(padded_size(p.counts[2])), sums(kBlockCols * pitch(p) + kMaxReadAhead) {}
-  static int64_t pitch(const VoxelProblem& p) { return p.rows + kMaxReadAhead; }
+      : column(padded_size(p.counts[2])),
+        sums(kBlockLines * pitch(p) + kMaxReadAhead),
+        along(pitch(p)),
+        line(std::max(p.rows, p.cols)) {}
+  static int64_t pitch(const VoxelProblem& p) { return std::max(p.rows, p.cols) + kMaxReadAhead; }
 };
 
 template <typename scalar_t, int L>
@@ -48,98 +53,40 @@ TORCHKCREG_INLINE void project_upright_column(const VoxelProblem& p, const Latti
   if (ray.flipped) std::reverse(sums, sums + p.rows);
 }
 
-// Adds up L rays from (u, v) on that share a major axis and their sense along it.
 template <typename scalar_t, int L>
-struct RayBundle {
-  using S = Simd<scalar_t, L>;
-  scalar_t start[2][L], slope[2][L], length[L];
-  PlaneRange planes;
-
-  TORCHKCREG_INLINE bool collect(const VoxelProblem& p, const RayView& view, int axis, double sense, int64_t u,
-                                 int64_t v) {
-    planes = {p.counts[axis], -1};
-    for (int l = 0; l < L; ++l) {
-      double d[3];
-      view.direction(double(u + l), double(v), d);
-      const bool member = u + l < p.cols && RayView::major_axis(d) == axis && d[axis] * sense > 0;
-      length[l] = 0;
-      for (int k = 0; k < 2; ++k) start[k][l] = -1, slope[k][l] = 0;  // in the frame of zeros
-      if (!member) continue;
-      const Crossings c = view.crossings(axis, d);
-      PlaneRange range = view.ahead(axis, sense, p.counts[axis]);
-      for (int k = 0; k < 2; ++k) {
-        start[k][l] = scalar_t(c.start[k]), slope[k][l] = scalar_t(c.slope[k]);
-        narrow(c.start[k], c.slope[k], p.counts[other_axis(axis, k)], range);
-      }
-      if (range.first > range.last) continue;
-      planes = {std::min(planes.first, range.first), std::max(planes.last, range.last)};
-      double square = 0;
-      for (int k = 0; k < 3; ++k) square += d[k] * p.spacing[k] * d[k] * p.spacing[k];
-      length[l] = scalar_t(std::sqrt(square) / std::abs(d[axis]));
-    }
-    return planes.first <= planes.last;
+TORCHKCREG_INLINE void project_tilted_line(const VoxelProblem& p, const Lattice<scalar_t>& lattice, const RayView& view,
+                                           int64_t number, ProjectScratch<scalar_t>& scratch, scalar_t* sums) {
+  RayLine<scalar_t>& line = scratch.line;
+  line.read_senses(view, number, view.lanes_down ? p.rows : p.cols);
+  std::fill(sums, sums + line.count, scalar_t(0));
+  for (const int8_t sense : {0, 1, 2, 4, 5, 6}) {
+    if (!line.select(view, number, sense, p.counts, p.spacing)) continue;
+    scalar_t* along = scratch.along.data();
+    std::fill(along + line.begin, along + line.end, scalar_t(0));
+    add_line<scalar_t, L>(line, lattice, p.counts, along);
+    for (int64_t n = line.begin; n < line.end; ++n) sums[n] += along[n] * line.length[n];
   }
-
-  TORCHKCREG_INLINE void add(const VoxelProblem& p, const Lattice<scalar_t>& lattice, int axis, scalar_t* sums) const {
-    typename S::V start_[2], slope_[2], high[2], sum = S::spread(0);
-    int64_t stride[2];
-    for (int k = 0; k < 2; ++k) {
-      start_[k] = S::load(start[k]) + scalar_t(1);  // positions count from the frame
-      slope_[k] = S::load(slope[k]);
-      high[k] = S::spread(scalar_t(p.counts[other_axis(axis, k)] + 1));
-      stride[k] = lattice.stride(other_axis(axis, k));
-    }
-    using int_t = typename S::int_t;
-    for (int64_t plane = planes.first; plane <= planes.last; ++plane) {
-      typename S::I index = S::truncate(S::spread(0));
-      typename S::V fraction[2];
-      for (int k = 0; k < 2; ++k) {
-        const typename S::V position =
-            S::smaller(S::larger(start_[k] + slope_[k] * scalar_t(plane), S::spread(0)), high[k]);
-        const typename S::I below = S::truncate(S::smaller(position, high[k] - scalar_t(1)));
-        fraction[k] = position - S::number(below);
-        index += below * static_cast<int_t>(stride[k]);
-      }
-      int64_t corner[3] = {-1, -1, -1};
-      corner[axis] = plane;
-      const scalar_t* from = lattice.at(corner[0], corner[1], corner[2]);
-      const typename S::V near = S::gather(from, index), next = S::gather(from + stride[0], index);
-      const typename S::V far = S::gather(from + stride[1], index);
-      const typename S::V farthest = S::gather(from + stride[0] + stride[1], index);
-      const typename S::V low = near + fraction[0] * (next - near), up = far + fraction[0] * (farthest - far);
-      sum += low + fraction[1] * (up - low);
-    }
-    S::store(sums, S::load(sums) + sum * S::load(length));
-  }
-};
+}
 
 template <typename scalar_t, int L>
 TORCHKCREG_INLINE void project_block_kernel(const VoxelProblem& p, const Lattice<scalar_t>& lattice,
                                             const RayView& view, int64_t begin, ProjectScratch<scalar_t>& scratch,
                                             scalar_t* image) {
-  const int64_t end = std::min(begin + kBlockCols, p.cols), pitch = ProjectScratch<scalar_t>::pitch(p);
-  if (view.upright) {
-    for (int64_t u = begin; u < end; ++u) {
-      project_upright_column<scalar_t, L>(p, lattice, view, u, scratch.column.data() + kColumnPad,
-                                          scratch.sums.data() + (u - begin) * pitch);
+  const int64_t lines = view.lanes_down ? p.cols : p.rows, rays = view.lanes_down ? p.rows : p.cols;
+  const int64_t end = std::min(begin + kBlockLines, lines), pitch = ProjectScratch<scalar_t>::pitch(p);
+  for (int64_t line = begin; line < end; ++line) {
+    scalar_t* sums = scratch.sums.data() + (line - begin) * pitch;
+    if (view.upright) {
+      project_upright_column<scalar_t, L>(p, lattice, view, line, scratch.column.data() + kColumnPad, sums);
+    } else {
+      project_tilted_line<scalar_t, L>(p, lattice, view, line, scratch, sums);
     }
-    for (int64_t v = 0; v < p.rows; ++v) {
-      for (int64_t u = begin; u < end; ++u) image[v * p.cols + u] = scratch.sums[(u - begin) * pitch + v];
-    }
-    return;
   }
-  RayBundle<scalar_t, L> bundle;
-  scalar_t sums[kBlockCols + L];
-  for (int64_t v = 0; v < p.rows; ++v) {
-    std::fill(sums, sums + kBlockCols + L, scalar_t(0));
-    for (int64_t u = begin; u < end; u += L) {
-      for (int axis = 0; axis < 3; ++axis) {
-        for (const double sense : {1.0, -1.0}) {
-          if (bundle.collect(p, view, axis, sense, u, v)) bundle.add(p, lattice, axis, sums + (u - begin));
-        }
-      }
+  const int64_t next_line = view.lanes_down ? 1 : p.cols, next_ray = view.lanes_down ? p.cols : 1;
+  for (int64_t n = 0; n < rays; ++n) {
+    for (int64_t line = begin; line < end; ++line) {
+      image[line * next_line + n * next_ray] = scratch.sums[(line - begin) * pitch + n];
     }
-    std::copy(sums, sums + (end - begin), image + v * p.cols + begin);
   }
 }
 
@@ -155,14 +102,14 @@ TORCHKCREG_BY_PROCESSOR(double, project_block,
 template <typename scalar_t>
 void project(const VoxelProblem& p, const scalar_t* volumes, scalar_t* images) {
   Lattice<scalar_t> lattice(p.counts);
-  const int64_t blocks = (p.cols + kBlockCols - 1) / kBlockCols;
+  const int64_t blocks = (std::max(p.cols, p.rows) + kBlockLines - 1) / kBlockLines;
   for (int64_t b = 0; b < p.batch; ++b) {
     lattice.copy_from(volumes + b * p.voxels());
     torch::stable::parallel_for(0, p.num_views() * blocks, 1, [&](int64_t begin, int64_t end) {
       ProjectScratch<scalar_t> scratch(p);
       for (int64_t t = begin; t < end; ++t) {
         scalar_t* image = images + (b * p.num_views() + t / blocks) * p.pixels();
-        project_block(p, lattice, p.views[t / blocks], t % blocks * kBlockCols, scratch, image);
+        project_block(p, lattice, p.views[t / blocks], t % blocks * kBlockLines, scratch, image);
       }
     });
   }

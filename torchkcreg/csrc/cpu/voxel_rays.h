@@ -27,7 +27,8 @@ inline int other_axis(int axis, int which) { return which == 0 ? (axis == 0 ? 1 
 struct RayView {
   double directions[3][3];  // ray of pixel (u, v): directions (u, v, 1)
   double source[3];
-  bool upright;  // detector columns are parallel to z: along one, rays share their way in x and y
+  bool upright;     // detector columns are parallel to z: along one, rays share their way in x and y
+  bool lanes_down;  // of columns and rows, columns are closer to z
 
   TORCHKCREG_INLINE void direction(double u, double v, double* d) const {
     for (int k = 0; k < 3; ++k) d[k] = directions[k][0] * u + directions[k][1] * v + directions[k][2];
@@ -139,6 +140,8 @@ inline RayView read_view(const double* matrix, const int64_t* counts, int64_t ro
     depth += std::abs(cofactors[k] / determinant) * reach;
   }
   const double drift = std::max(std::abs(d[0][1]), std::abs(d[1][1])) * depth * double(rows);
+  const auto lies = [&](int j) { return std::hypot(d[0][j], d[1][j]) * std::abs(d[2][1 - j]); };
+  view.lanes_down = lies(1) <= lies(0);
   view.upright = drift < 1e-4;  // voxels, between the ends of a column
   for (int64_t u = 0; u < cols && view.upright; ++u) {
     for (const int64_t v : {int64_t(0), rows - 1}) {  // where rays are steepest
