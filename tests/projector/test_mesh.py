@@ -6,6 +6,7 @@ import pytest
 import torch
 import trimesh
 
+from torchkcreg.kernels import unavailable_reason
 from torchkcreg.projector.mesh import project_mesh
 
 # source at (0, 0, -500), detector 1000 px behind the source, pixel (15, 15) on the axis; u, v, ray are left-handed
@@ -135,6 +136,88 @@ def test_vertices_and_matrices_can_be_differentiated_silhouettes_included():
     assert float(weighted(vertices, matrix)) > 1
     inputs = (vertices.requires_grad_(), matrix.requires_grad_())
     assert torch.autograd.gradcheck(weighted, inputs, eps=1e-5, atol=1e-4, rtol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def compiled_kernels():
+    if unavailable_reason() is not None:
+        pytest.skip("the C++ kernels can be neither loaded nor compiled here")
+
+
+def both_backends(mesh: trimesh.Trimesh, det_shape: tuple[int, int]) -> list[tuple[torch.Tensor, ...]]:
+    """Images and gradients to vertices and matrices, in C++ and in torch."""
+    results = []
+    for backend in ("cpp", "torch"):
+        vertices, faces = tensors(mesh)
+        matrices = torch.stack([MATRIX, OBLIQUE]).requires_grad_()
+        image = project_mesh(vertices.requires_grad_(), faces, matrices, det_shape, backend=backend)
+        weights = torch.rand(image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+        results.append((image.detach(), *torch.autograd.grad((image * weights).sum(), (vertices, matrices))))
+    return results
+
+
+@pytest.mark.usefixtures("compiled_kernels")
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.box([5.0, 7.0, 40.0]),  # corners and edges on pixels' borders, faces of many pixels
+        trimesh.creation.icosphere(3, 6.0),
+        trimesh.creation.icosphere(4, 0.7),  # many triangles in a pixel
+        trimesh.creation.cylinder(0.5, 60.0, transform=trimesh.transformations.rotation_matrix(0.3, [1, 1, 0])),
+        trimesh.creation.box([50.0, 3.0, 3.0]),  # longer than the detector
+    ],
+    ids=["box", "sphere", "small", "rod", "long"],
+)
+def test_cpp_gives_the_numbers_of_the_reference_and_their_gradients(mesh):
+    mesh = mesh.copy()
+    mesh.apply_translation([0.31, -0.27, 1.0])
+    for shape in ((31, 31), (40, 23)):
+        (image, *gradients), (expected, *expected_gradients) = both_backends(mesh, shape)
+        assert float(expected.max()) > 0.5
+        torch.testing.assert_close(image, expected, rtol=1e-7, atol=1e-9)
+        for gradient, truth in zip(gradients, expected_gradients):
+            assert float((gradient - truth).norm() / truth.norm()) < 1e-4  # quadrature, where w varies
+
+
+@pytest.mark.usefixtures("compiled_kernels")
+def test_any_number_of_threads_gives_the_same_bits():
+    mesh = trimesh.creation.icosphere(4, 6.0)
+    many = both_backends(mesh, (95, 64))[0]
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = both_backends(mesh, (95, 64))[0]
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(many, one))
+
+
+@pytest.mark.usefixtures("compiled_kernels")
+def test_forward_and_second_derivatives_are_those_of_the_reference():
+    vertices, faces = tensors(trimesh.creation.box([1.3, 0.9, 2.0]))
+    render = lambda x, backend: project_mesh(x, faces, OBLIQUE[None], (31, 31), backend=backend).square().sum()  # noqa: E731
+    tangent = torch.rand(vertices.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    pushed = [torch.func.jvp(lambda x, b=b: render(x, b), (vertices,), (tangent,))[1] for b in ("cpp", "torch")]
+    torch.testing.assert_close(*pushed, rtol=1e-6, atol=0)
+
+
+@pytest.mark.usefixtures("compiled_kernels")
+def test_an_edge_on_a_pixels_border_moves_for_one_pixel_alone():
+    box = trimesh.creation.box([6.0, 6.0, 10.0])
+    box.apply_translation([0.3, 0.2, 0.0])
+    fine = box.subdivide()  # the new corners lie in the faces, where moving them along the face changes nothing
+    on_front = fine.vertices[:, 2] == -5
+    corner = int(((fine.vertices - [0.3, 0.2, -5]) ** 2).sum(1).argmin())
+    assert on_front[corner]
+    vertices, faces = tensors(fine)
+    depth = 495.0
+    shift = torch.tensor([0.3, 0.2], dtype=torch.float64) - 0.5 / 1000 * depth  # puts that corner between two pixels
+    vertices[:, :2] -= shift
+    vertices.requires_grad_()
+    weights = torch.rand(31, 31, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    image = project_mesh(vertices, faces, MATRIX[None], DET_SHAPE)[0]
+    (gradient,) = torch.autograd.grad((image * weights).sum(), vertices)
+    assert float(gradient[corner, :2].abs().max()) < 1e-6 * float(gradient.abs().max())
 
 
 def test_a_moving_silhouette_changes_the_sum_as_its_area():

@@ -13,6 +13,7 @@ import torch
 PACKAGE = Path(__file__).resolve().parent.parent
 SOURCES = (
     "csrc/cpu/blur.cpp",
+    "csrc/cpu/mesh_lengths.cpp",
     "csrc/cpu/point_drr.cpp",
     "csrc/cpu/splines.cpp",
     "csrc/cpu/transmission.cpp",

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from torchkcreg.differentiable import is_transformed
+from torchkcreg.differentiable import differentiable
+from torchkcreg.kernels import Operator, choose_backend
 from torchkcreg.precision import full_precision
-
-MAX_PAIRS = 1 << 20  # (triangle, pixel) pairs looked at together
-MAX_CLIPPED_PAIRS = 1 << 14  # pairs clipped together: what they need stays in a core's cache
+from torchkcreg.projector.mesh_reference import integrate_triangles
 
 
 @full_precision
-def project_mesh(vertices: Tensor, faces: Tensor, projection_matrices: Tensor, det_shape: tuple[int, int]) -> Tensor:
+def project_mesh(
+    vertices: Tensor, faces: Tensor, projection_matrices: Tensor, det_shape: tuple[int, int], *, backend: str = "auto"
+) -> Tensor:
     """Path lengths in mm through a closed mesh, `(..., V, rows, cols)`, each the average over its pixel.
 
     A ray's chord is the sum over the triangles it meets of the distance from the source, negative where it enters and
@@ -34,6 +34,7 @@ def project_mesh(vertices: Tensor, faces: Tensor, projection_matrices: Tensor, d
             lengths). An open mesh gives nonsense of the size of the depth.
         projection_matrices: `(V, 3, 4)`, world mm to homogeneous pixels, the last row giving the depth in mm.
         det_shape: Rows and columns of the detector.
+        backend: "auto", "cpp" or "torch".
 
     Raises:
         ValueError: If a shape or an index is wrong, or a vertex is not in front of the source.
@@ -49,35 +50,49 @@ def project_mesh(vertices: Tensor, faces: Tensor, projection_matrices: Tensor, d
     dtype = vertices.dtype if vertices.dtype.is_floating_point else torch.get_default_dtype()
     faces = faces.to(vertices.device, torch.long)
     matrices = projection_matrices.to(vertices.device, torch.float64)
-    shapes = vertices.reshape(-1, *vertices.shape[-2:]).to(torch.float64)
-    images = [_project_view(shape, faces, matrix, det_shape) for shape in shapes for matrix in matrices]
-    stacked = torch.stack(images) if images else shapes.new_zeros(0, *det_shape)
-    return stacked.reshape(*vertices.shape[:-2], len(matrices), *det_shape).to(dtype)
-
-
-def _project_view(vertices: Tensor, faces: Tensor, matrix: Tensor, det_shape: tuple[int, int]) -> Tensor:
-    """Path lengths (rows, cols) of one mesh in one view."""
-    rows, cols = det_shape
-    homogeneous = vertices @ matrix[:, :3].T + matrix[:, 3]
-    depth = homogeneous[:, 2:]
+    shapes = vertices.reshape(-1, 1, *vertices.shape[-2:]).to(torch.float64)
+    homogeneous = shapes @ matrices[:, :, :3].mT + matrices[:, None, :, 3]
+    depth = homogeneous[..., 2:]
     if bool((depth <= 0).any()):
         raise ValueError(f"vertices must lie in front of the source, got a depth of {float(depth.min()):g} mm")
     # u, v shifted so that pixel (row, col) is the square [col, col + 1] x [row, row + 1]
-    projected = torch.cat([homogeneous[:, :2] / depth + 0.5, 1 / depth], dim=1)
-    corners = projected.index_select(0, faces.flatten()).reshape(-1, 3, 3)
-    image = corners.new_zeros(rows * cols)
-    for triangles, row, col in _pairs(corners.detach(), det_shape):
-        inside, crossing = _classify(corners.detach(), triangles, row, col)
-        covered, row_in, col_in = triangles[inside], row[inside], col[inside]
-        image = image.index_add(0, row_in * cols + col_in, _whole_pixels(corners, covered, row_in, col_in))
-        parts = (x[crossing].split(MAX_CLIPPED_PAIRS) for x in (triangles, row, col))
-        for triangle, row_cut, col_cut in zip(*parts):
-            if corners.requires_grad and torch.is_grad_enabled() and not is_transformed(corners):
-                values = checkpoint(_cut_pixels, corners, triangle, row_cut, col_cut, use_reentrant=False)
-            else:
-                values = _cut_pixels(corners, triangle, row_cut, col_cut)
-            image = image.index_add(0, row_cut * cols + col_cut, values)
-    return image.reshape(rows, cols) * _distance_per_depth(matrix, det_shape)
+    projected = torch.cat([homogeneous[..., :2] / depth + 0.5, 1 / depth], dim=-1)
+    images = _signed_depths(projected.flatten(0, 1), faces, det_shape, backend).reshape(
+        *projected.shape[:2], *det_shape
+    )
+    lengths = images * torch.stack([_distance_per_depth(matrix, det_shape) for matrix in matrices])
+    return lengths.reshape(*vertices.shape[:-2], len(matrices), *det_shape).to(dtype)
+
+
+def _signed_depths(projected: Tensor, faces: Tensor, det_shape: tuple[int, int], backend: str) -> Tensor:
+    """The images of projected vertices (B, n, 3): (B, rows, cols)."""
+    if choose_backend(projected, backend, operator=MESH_LENGTHS.name).is_reference:
+        return integrate_triangles(projected, faces, *det_shape)
+    return differentiable(_MeshKernel(faces, det_shape), projected)
+
+
+class _MeshKernel:
+    """The kernel of one mesh and detector; its derivatives by `torchkcreg.differentiable`."""
+
+    def __init__(self, faces: Tensor, det_shape: tuple[int, int]) -> None:
+        self._faces, self._det_shape = faces, det_shape
+
+    def forward(self, projected: Tensor) -> Tensor:
+        return MESH_LENGTHS.dispatched(projected, self._faces, *self._det_shape)
+
+    def reference(self, projected: Tensor) -> Tensor:
+        return integrate_triangles(projected, self._faces, *self._det_shape)
+
+    def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> Sequence[Tensor | None]:
+        return (MESH_LENGTHS_BACKWARD.dispatched(gradient.contiguous(), *inputs, self._faces),)
+
+
+def _gradient(gradient: Tensor, projected: Tensor, faces: Tensor) -> Tensor:
+    """The gradient by autograd."""
+    leaf = projected.detach().requires_grad_(True)
+    with torch.enable_grad():
+        images = integrate_triangles(leaf, faces, *gradient.shape[-2:])
+    return torch.autograd.grad(images, leaf, gradient)[0]
 
 
 def _distance_per_depth(matrix: Tensor, det_shape: tuple[int, int]) -> Tensor:
@@ -86,119 +101,6 @@ def _distance_per_depth(matrix: Tensor, det_shape: tuple[int, int]) -> Tensor:
     inverse = torch.linalg.inv(matrix[:, :3])
     rays = inverse[:, 0] * cols[None, :, None] + inverse[:, 1] * rows[:, None, None] + inverse[:, 2]
     return rays.norm(dim=-1) * torch.linalg.det(matrix[:, :3]).sign()
-
-
-def _pairs(corners: Tensor, det_shape: tuple[int, int]) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Triangle, row and column of every pair of a triangle and a pixel of its bounding box, in chunks."""
-    rows, cols = det_shape
-    low, high = corners[:, :, :2].amin(1).floor(), corners[:, :, :2].amax(1).floor() + 1
-    limits = corners.new_tensor([cols, rows])
-    low = low.clamp(min=torch.zeros_like(limits), max=limits).long()
-    high = high.clamp(min=torch.zeros_like(limits), max=limits).long()
-    size = high - low
-    counts = size.prod(dim=1)
-    chunk = (counts.cumsum(0) - counts) // MAX_PAIRS
-    for triangles in torch.arange(len(counts), device=corners.device).split(torch.bincount(chunk).tolist()):
-        count = counts[triangles]
-        triangle = triangles.repeat_interleave(count)
-        start = (count.cumsum(0) - count).repeat_interleave(count)
-        index = torch.arange(len(triangle), device=corners.device) - start
-        width = size[triangle, 0]
-        row = torch.div(index, width, rounding_mode="floor")
-        yield triangle, low[triangle, 1] + row, low[triangle, 0] + index - row * width
-
-
-def _classify(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> tuple[Tensor, Tensor]:
-    """Which pairs' pixels lie wholly inside their triangle, and which may be cut by its outline."""
-    u, v = corners[..., 0], corners[..., 1]
-    du, dv = u.roll(-1, 1) - u, v.roll(-1, 1) - v
-    orientation = (du[:, 0] * dv[:, 1] - dv[:, 0] * du[:, 1]).sign()[:, None]
-    du, dv = du * orientation, dv * orientation
-    # an edge's function is positive inside; over a pixel it varies by +-(|du| + |dv|) / 2 about its centre
-    constant, spread = du * v - dv * u, (du.abs() + dv.abs()) / 2
-    centre_u, centre_v = col + 0.5, row + 0.5
-    inside = (orientation[:, 0] != 0)[triangle]
-    crossing = inside.clone()
-    for edge in range(3):
-        value = du[triangle, edge] * centre_v - dv[triangle, edge] * centre_u - constant[triangle, edge]
-        reach = spread[triangle, edge]
-        inside &= value >= reach
-        crossing &= value > -reach
-    return inside, crossing & ~inside
-
-
-def _whole_pixels(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """Mean signed depth of triangles over pixels that they cover."""
-    used, triangle = torch.unique(triangle, return_inverse=True)
-    origin, first, second = corners.index_select(0, used).unbind(1)
-    first, second = first - origin, second - origin
-    area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    slope_u = (first[:, 2] * second[:, 1] - second[:, 2] * first[:, 1]) / area
-    slope_v = (second[:, 2] * first[:, 0] - first[:, 2] * second[:, 0]) / area
-    constant = origin[:, 2] - slope_u * origin[:, 0] - slope_v * origin[:, 1]
-    planes = torch.stack([constant, slope_u, slope_v, area.sign()], dim=1).index_select(0, triangle)
-    centre = planes[:, 0] + planes[:, 1] * (col + 0.5) + planes[:, 2] * (row + 0.5)
-    variance = (planes[:, 1] ** 2 + planes[:, 2] ** 2) / 12
-    return planes[:, 3] / centre * (1 + variance / centre**2)
-
-
-def _cut_pixels(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """Signed depth of triangles integrated over their part of a pixel."""
-    polygon = corners.index_select(0, triangle)
-    zero = torch.zeros_like(col)
-    polygon = polygon - torch.stack([col, row, zero], dim=1).to(polygon)[:, None]
-    for axis in (0, 1):
-        polygon = _clip(polygon, polygon[..., axis])
-        polygon = _clip(polygon, 1 - polygon[..., axis])
-    u, v, w = polygon.unbind(-1)
-    first_u, first_v, first_w = u[:, :1], v[:, :1], w[:, :1]
-    du, dv = u[:, 1:] - first_u, v[:, 1:] - first_v
-    area = (du[:, :-1] * dv[:, 1:] - dv[:, :-1] * du[:, 1:]) / 2
-    return (area * _mean_reciprocal(first_w, w[:, 1:-1], w[:, 2:])).sum(1)
-
-
-def _clip(polygon: Tensor, height: Tensor) -> Tensor:
-    """Convex polygons (P, k, 3) cut where their vertices' height (P, k) is negative: (P, k + 1, 3), the last repeated.
-
-    The result is the vertices inside, the crossing where the outline leaves, as often as fills the row, and the one
-    where it comes back. Polygons wholly outside collapse to no area.
-    """
-    size = polygon.shape[1]
-    kept = height.detach() >= 0
-    number = kept.sum(1, keepdim=True)
-    entering = kept & ~kept.roll(1, 1)
-    start = entering.to(torch.uint8).argmax(1, keepdim=True)  # 0 where the outline never leaves
-    steps = torch.arange(size, device=polygon.device)
-    order = (start + steps) % size  # inside vertices first, then those outside
-    points = polygon.gather(1, order[..., None].expand_as(polygon))
-    heights = height.gather(1, order)
-    last = (number - 1).clamp_min(0)
-    leaves = _crossing(points, heights, last, (last + 1).clamp_max(size - 1))
-    enters = _crossing(points, heights, torch.full_like(last, size - 1), torch.zeros_like(last))
-    body = torch.where((steps < number)[..., None], points, leaves)
-    closing = torch.where((number == size)[..., None], points[:, -1:], enters)
-    return torch.cat([body, closing], dim=1)
-
-
-def _crossing(points: Tensor, heights: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """Points (P, 1, 3) where the edge between two vertices crosses height zero."""
-    a, b = (points.gather(1, index[..., None].expand(-1, -1, 3)) for index in (inside, outside))
-    h_a, h_b = heights.gather(1, inside), heights.gather(1, outside)
-    crosses = (h_a.detach() >= 0) != (h_b.detach() >= 0)
-    share = h_a / torch.where(crosses, h_a - h_b, torch.ones_like(h_a))
-    return a + torch.where(crosses, share, torch.zeros_like(share))[..., None] * (b - a)
-
-
-def _mean_reciprocal(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Mean of 1 / w over a triangle where w is affine with values a, b, c at its corners.
-
-    A series in w's deviation from its mean m: `1/m (1 + E2/m^2 - E3/m^3 + E4/m^4)`, with the triangle's moments
-    `E2 = -e2/6, E3 = e3/10, E4 = e2^2/15` from the elementary symmetric polynomials of the corners' deviations.
-    """
-    mean = (a + b + c) / 3
-    a, b, c = a / mean - 1, b / mean - 1, c / mean - 1
-    pairs, product = a * b + a * c + b * c, a * b * c
-    return (1 - pairs / 6 - product / 10 + pairs**2 / 15) / mean
 
 
 def _check_arguments(vertices: Tensor, faces: Tensor, projection_matrices: Tensor, det_shape: tuple[int, int]) -> None:
@@ -215,3 +117,16 @@ def _check_arguments(vertices: Tensor, faces: Tensor, projection_matrices: Tenso
         raise ValueError(f"projection_matrices must have shape (V, 3, 4), got {tuple(projection_matrices.shape)}")
     if len(det_shape) != 2 or min(det_shape) < 1:
         raise ValueError(f"det_shape must be two positive numbers, got {tuple(det_shape)}")
+
+
+# projected (B, n, 3), faces (m, 3) -> (B, rows, cols)
+MESH_LENGTHS = Operator(
+    "mesh_lengths(Tensor projected, Tensor faces, int rows, int cols) -> Tensor",
+    reference=integrate_triangles,
+    fake=lambda projected, faces, rows, cols: projected.new_empty(len(projected), rows, cols),
+)
+MESH_LENGTHS_BACKWARD = Operator(
+    "mesh_lengths_backward(Tensor gradient, Tensor projected, Tensor faces) -> Tensor",
+    reference=_gradient,
+    fake=lambda gradient, projected, faces: torch.empty_like(projected),
+)
