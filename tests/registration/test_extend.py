@@ -7,7 +7,8 @@ import torch
 from small_scene import RIGID, SCREW, bend, geometry, image, plate, pose, scene
 
 from torchkcreg.deformation import LinearDeformation, RigidDeformation
-from torchkcreg.geometry import transform_points
+from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, transform_points
+from torchkcreg.reconstruction import PWLSConfig, reconstruct
 from torchkcreg.registration import (
     Callback,
     Implant,
@@ -272,6 +273,20 @@ def test_known_components_and_the_beam_come_from_the_result_in_memory() -> None:
     scatter = result.scatter(torch.exp(-data.line_integrals), data.geometry)
     assert scatter.shape == data.line_integrals.shape
     assert 0 < float(scatter.mean()) <= result.intensity["scatter"]
+    transmission = torch.exp(-data.line_integrals)
+    found = result.known(transmission, data.geometry)
+    assert [part.material for part in found["components"]] == ["titanium", "steel"]
+    spacing = data.geometry.pixel_spacing[0]
+    assert found["blur_sigma_px"] == pytest.approx(result.intensity["blur_sigma_px"]) and found["blur_sigma_px"] > 0
+    halved = result.known(
+        transmission, ConeBeamGeometry(data.geometry.projection_matrices, data.geometry.det_shape, (2 * spacing,) * 2)
+    )
+    assert halved["blur_sigma_px"] == pytest.approx(found["blur_sigma_px"] / 2)  # pixels are larger
+    again = RegistrationResult.from_dict(result.to_dict())
+    assert again.blur_mm == pytest.approx(result.intensity["blur_sigma_px"] * spacing)
+    grid = VolumeGrid.centered((10, 6, 6), 2.0)
+    done = reconstruct(transmission, data.geometry, grid, config=PWLSConfig(iterations=1, subsets=1), passes=1, **found)
+    assert done.volume.isfinite().all() and done.mask is not None and float(done.mask.min()) < 0.5
     plain = register(plate(), image(scene(RIGIDLY)), RIGIDLY.model_copy(update={"stages": RIGID[1:2]}))
     with pytest.raises(ValueError, match="registered without a material"):
         plain.known_components()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -55,9 +56,17 @@ def finished(
         warnings=reasons,
         diagnostics=asdict(found),
         intensity={name: float(value.detach()) for name, value in scene.intensity.named_parameters()},
+        blur_mm=_blur_mm(scene, data),
         view_motions=None if scene.view_motions is None else scene.view_motions.matrices(),
         scene=scene,
     )
+
+
+def _blur_mm(scene: Scene, data: RegistrationData) -> float:
+    """The intensity model's blur on the detector."""
+    blur = scene.intensity.free.get("blur")
+    sigma_px = 0.0 if blur is None else float(getattr(scene.intensity, blur.attribute).detach())
+    return sigma_px * math.sqrt(data.geometry.pixel_spacing[0] * data.geometry.pixel_spacing[1])
 
 
 def _diagnosed(run: StageRun, data: RegistrationData) -> StageRun:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
@@ -40,6 +43,7 @@ class RegistrationResult(RegisteredImplants):
             error of the implant's nodes.
         stages: One record a stage: iterations, converged, loss, undone.
         intensity: Estimated parameters of the intensity model.
+        blur_mm: Standard deviation of the system's blur on the detector, as it was found; 0 where none was modelled.
         view_motions: Rigid motions (V, 4, 4) of the world before it was projected in each view, ``P_v T_v``, where they
             were found to be other than the geometry has it; None where the geometry is as it was told.
         scene: The scene as it was registered; None for one that was read from a run folder.
@@ -55,6 +59,7 @@ class RegistrationResult(RegisteredImplants):
     diagnostics: dict[str, Any] = field(default_factory=dict)
     stages: list[dict[str, Any]] = field(default_factory=list)
     intensity: dict[str, float] = field(default_factory=dict)
+    blur_mm: float = 0.0
     view_motions: Tensor | None = None
     scene: Scene | None = field(default=None, repr=False)
 
@@ -96,6 +101,36 @@ class RegistrationResult(RegisteredImplants):
         data = RegistrationData.of_transmission(geometry, transmission, mask)
         levels = transmission.new_tensor([[self.intensity.get(name, 0.0) for name in ("scatter", "scatter_removed")]])
         return scattered_signal(levels, data.with_scatter_shapes(self.config.scatter_mm).scatter_shapes)[0]
+
+    def known(
+        self,
+        transmission: Tensor,
+        geometry: ConeBeamGeometry,
+        meshes: trimesh.Trimesh | Mapping[str, trimesh.Trimesh] | None = None,
+        *,
+        mask: Tensor | None = None,
+    ) -> dict[str, Any]:
+        """What a reconstruction of the whole scan takes from the registration, as arguments of its `reconstruct`.
+
+        Beam, components in their place, scatter and blur, all as the registration found them:
+        ``reconstruct(transmission, geometry, grid, **result.known(transmission, geometry, mesh))``.
+
+        Args:
+            transmission: Measured intensity over the open beam's, shape (V, rows, cols), of all views.
+            geometry: The views.
+            meshes: See :meth:`known_components`.
+            mask: 0 where a pixel holds no measurement.
+
+        Raises:
+            ValueError: As :meth:`beam` and :meth:`known_components` do.
+        """
+        return {
+            "beam": self.beam(),
+            "components": self.known_components(meshes),
+            "scatter": self.scatter(transmission, geometry, mask=mask),
+            "mask": mask,
+            "blur_sigma_px": self.blur_mm / math.sqrt(geometry.pixel_spacing[0] * geometry.pixel_spacing[1]),
+        }
 
     def to(self, device: torch.device | str) -> RegistrationResult:
         """The result, moved to a device."""
@@ -156,6 +191,7 @@ class RegistrationResult(RegisteredImplants):
             "units": "mm",
             "implants": [implant.to_dict() for implant in self.implants],
             "intensity": self.intensity,
+            "blur_mm": self.blur_mm,
             "gc": self.gc.tolist(),
             "seed": self.seed,
             "status": self.status,
@@ -192,6 +228,7 @@ class RegistrationResult(RegisteredImplants):
             history=list(history or []),
             config=RegistrationConfig.model_validate(content["config"]),
             seed=int(content.get("seed", 0)),
+            blur_mm=finite_number(content.get("blur_mm", 0.0), "blur_mm"),
             view_motions=_motions(content.get("view_motions")),
             status=content.get("status", "ok"),
             diagnostics=dict(content.get("diagnostics", {})),
