@@ -15,6 +15,8 @@ from torchkcreg.experiments import (
 from torchkcreg.experiments.reconstruct_files import resolve_options
 from torchkcreg.geometry import circular_geometry
 from torchkcreg.io import RunFolder, read_volume, write_geometry, write_projections
+from torchkcreg.physics import Beam, material, tungsten_spectrum
+from torchkcreg.reconstruction import component_path_lengths
 from torchkcreg.simulation.solids import Sphere
 
 
@@ -104,6 +106,26 @@ def test_kcmar_is_an_fdk_around_the_registered_metal(ball_scan, small_run, tmp_p
     assert metrics["components"].count("steel") > 1 and metrics["passes"] is None
     assert main(arguments(ball_scan, tmp_path / "other", *flags)) == 2
     assert "method kcmar needs the run of a registration" in capsys.readouterr().err
+
+
+def test_a_beam_that_nobody_knows_is_estimated_behind_the_registered_metal(ball_scan, small_run, tmp_path, capsys):
+    geometry = circular_geometry(range(0, 200, 8), sad=404, sdd=538, det_shape=(60, 50), pixel_spacing=(1.5, 1.5))
+    lengths = component_path_lengths(registered_components(small_run), geometry)
+    seen = Beam.of([material("steel")], tungsten_spectrum(90)).transmission(lengths[None].double())[0]
+    write_geometry(tmp_path / "geometry.json", geometry)
+    write_projections(tmp_path / "scan.npz", intensity=60000 * seen.float(), open_beam=60000.0)
+    files = ["--geometry", str(tmp_path / "geometry.json"), "--projections", str(tmp_path / "scan.npz")]
+    options = ["reconstruct", "--run", str(small_run), *files, "--spacing", "6", "--size", "60", "60", "120"]
+    options += ["--scatter", "none"]
+    estimated = ["--beam", "estimate", "--out", str(tmp_path / "out")]
+    assert main([*options, *estimated, "--method", "kcmar"]) == 0
+    beam = json.loads((tmp_path / "out" / "metrics.json").read_text())["beam"]
+    assert beam["alloys"] == ["steel"] and 0.9 < beam["scales"][0] < 1.1
+    assert (tmp_path / "out" / "beam.png").stat().st_size > 1000
+    assert main(arguments(ball_scan, tmp_path / "other", "--beam", "estimate")) == 2
+    assert "behind known metal, which kcrec and kcmar have, not fdk" in capsys.readouterr().err
+    assert main([*options, *estimated, "--method", "kcrec", "--monoenergetic", "--overwrite"]) == 2
+    assert "a beam of one energy cannot be estimated" in capsys.readouterr().err
 
 
 def test_the_registered_metal_has_the_volume_of_its_meshes(small_run, small_case):

@@ -152,6 +152,8 @@ def _add_reconstruct(commands) -> None:
     command.add_argument("--window", help="of the ramp: ram-lak, shepp-logan, cosine, hamming or hann (default)")
     command.add_argument("--scatter", help="auto (default), run (as found), none, or its fraction")
     command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")
+    estimated = "given (default), or estimate: out of the metal's shadow, where spectrum or alloy are not known"
+    command.add_argument("--beam", choices=("given", "estimate"), help=estimated)
     command.add_argument("--material", help="of the implant, where the registration had none")
     alone = "the object is of this material alone, such as an implant on a bench: fdk gives its share in each voxel"
     command.add_argument("--single-material", metavar="NAME", help=alone)

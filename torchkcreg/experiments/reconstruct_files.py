@@ -30,7 +30,7 @@ from torchkcreg.reconstruction import (
     reconstruct,
     with_components,
 )
-from torchkcreg.visualization import reconstruction_figure
+from torchkcreg.visualization import beam_figure, reconstruction_figure
 
 from .processes import processes
 from .reconstruction_inputs import (
@@ -41,7 +41,7 @@ from .reconstruction_inputs import (
 )
 
 CHECKPOINT_EVERY = 5
-OUTPUTS = ("volume.mha", "volume_hu.mha", "with_implant.mha", "slices.png")
+OUTPUTS = ("volume.mha", "volume_hu.mha", "with_implant.mha", "slices.png", "beam.png")
 
 
 def resolve_options(overrides: dict[str, Any], config: Path | None = None) -> ReconstructionOptions:
@@ -67,7 +67,8 @@ def reconstruct_files(
 
     The folder holds ``volume.mha`` in 1/mm (behind known components the background alone; of a single material the
     share of it, and no CT numbers), ``volume_hu.mha``,
-    ``with_implant.mha`` (with known components), ``metrics.json``, ``config.yaml`` and ``slices.png``. Under
+    ``with_implant.mha`` (with known components), ``metrics.json``, ``config.yaml``, ``slices.png``
+    and, of an estimated beam, ``beam.png``. Under
     ``torchrun`` the views are shared out over the processes and the first one writes.
 
     Args:
@@ -178,6 +179,7 @@ def _metrics(
         "reference_kev": beam.reference_kev,
         "water": beam.water,
         "scatter": _scatter_in_words(inputs.scatter),
+        "beam": None if inputs.estimate is None else inputs.estimate.in_words(),
         "components": [component.material for component in inputs.components],
         "passes": None if options.is_filtered else options.num_passes,
         "history": history,
@@ -222,6 +224,9 @@ def _write(
         middle, reach = grid.origin[2] + grid.size_mm[2] / 2, grid.size_mm[2] / 4
         heights = (middle - reach, middle, middle + reach) if grid.shape[0] > 3 else (middle,)
         window = (0.0, 1.2 if shares else 2 * beam.water)
+        if (found := inputs.estimate) is not None:
+            curve = beam_figure(found.beam.beam, found.alloys, found.lengths_mm, found.measured)
+            run.write_figure("beam.png", curve)
         run.write_figure(
             "slices.png", reconstruction_figure(shown, grid, heights_mm=heights, window=window, metal=metal)
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,9 +16,11 @@ from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.io import read_config, read_geometry, read_projections, read_run, read_spectrum
 from torchkcreg.physics import Spectrum, material, tungsten_spectrum
 from torchkcreg.reconstruction import (
+    BeamEstimate,
     BeamModel,
     KnownComponent,
     Veil,
+    estimate_beam,
     field_of_view_grid,
     filled,
     fit_veil,
@@ -26,6 +28,8 @@ from torchkcreg.reconstruction import (
 )
 
 from .registered_components import registered_components
+
+ALLOYS = ("titanium", "steel", "cocr")  # of which an implant is that nobody named
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,8 @@ class ReconstructionOptions(Config):
             kinds; "none"; or its fraction of the primary.
         scatter_sigma_mm: How broad a given fraction's scatter is.
         monoenergetic: One energy, as in the paper, even where a spectrum is known.
+        beam: "given" is the spectrum of the file and the materials of the run, or a likely one; "estimate" is what the
+            metal's shadow tells of a spectrum, or an implant's material, that nobody knows (methods with components).
         material: The implant's, where the registration had none.
         single_material: What the object is of, where it is of one material alone, such as an implant on a bench: "fdk"
             gives the share of it in each voxel, without beam hardening.
@@ -89,6 +95,7 @@ class ReconstructionOptions(Config):
     scatter: Literal["auto", "run", "none"] | float = "auto"
     scatter_sigma_mm: float = Field(40.0, gt=0)
     monoenergetic: bool = False
+    beam: Literal["given", "estimate"] = "given"
     material: str | None = None
     single_material: str | None = None
     backend: Literal["auto", "cpp", "torch"] = "auto"
@@ -118,6 +125,7 @@ class ReconstructionInputs:
         beam: Energies and the metals' attenuation.
         scatter: Smooth scatter, or an image of it in units of the open beam; None for none.
         spectrum: As detected; a likely one where no file says it.
+        estimate: What was estimated of the beam, where that was asked for.
         components: The metal in its place; none but for "kcrec" and "kcmar".
     """
 
@@ -129,6 +137,7 @@ class ReconstructionInputs:
     scatter: Veil | Tensor | None
     spectrum: Spectrum
     components: list[KnownComponent]
+    estimate: BeamEstimate | None = None
 
 
 def read_reconstruction_inputs(files: ReconstructionFiles, options: ReconstructionOptions) -> ReconstructionInputs:
@@ -144,11 +153,17 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     geometry = read_geometry(files.geometry)
     projections = read_projections(files.projections, open_beam=files.open_beam)
     projections.check_against(geometry)
-    components = []
+    components, named = [], options.material
     if options.method in ("kcrec", "kcmar"):
         if files.run is None:
             raise ValueError(f"method {options.method} needs the run of a registration: name it with --run")
-        components = registered_components(files.run, components=files.components, material=options.material)
+        named = options.material or read_run(files.run).implants[0].material
+        likely = ALLOYS[0] if options.beam == "estimate" and named is None else options.material
+        components = registered_components(files.run, components=files.components, material=likely)
+    elif options.beam == "estimate":
+        raise ValueError(f"a beam is estimated behind known metal, which kcrec and kcmar have, not {options.method}")
+    if options.beam == "estimate" and options.monoenergetic:
+        raise ValueError("a beam of one energy cannot be estimated: leave out monoenergetic, or the estimate")
     spectrum = read_spectrum(files.spectrum) if files.spectrum is not None else None
     if options.single_material is not None:
         material(options.single_material)
@@ -164,15 +179,36 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         scatter = read_run(files.run).scatter(transmission, geometry, mask=projections.mask)
     else:
         scatter = _scatter(transmission, projections.mask, geometry, options, saturated=projections.num_saturated > 0)
+    grid, estimate = _grid(geometry, options), None
+    if options.beam == "estimate":
+
+        def estimated(alloys: tuple[str, ...] = ()) -> BeamEstimate:
+            return estimate_beam(
+                transmission,
+                geometry,
+                grid,
+                components,
+                spectrum=spectrum,
+                scatter=scatter,
+                mask=projections.mask,
+                alloys=alloys,
+                backend=options.backend,
+            )
+
+        if named is None:
+            found = dict(zip(known_materials(components), estimated(ALLOYS).alloys, strict=True))
+            components = [replace(component, material=found[component.material]) for component in components]
+        estimate = estimated()
     return ReconstructionInputs(
         geometry,
         transmission,
         projections.mask,
-        _grid(geometry, options),
-        _beam(spectrum, options, components),
+        grid,
+        _beam(spectrum, options, components) if estimate is None else estimate.beam,
         scatter,
         spectrum or tungsten_spectrum(),
         components,
+        estimate,
     )
 
 

@@ -8,6 +8,7 @@ is the fast way around known metal (KC-MAR).
 from torchkcreg.physics import Veil, veil_image
 from torchkcreg.scene import KnownComponent
 
+from .beam_estimate import BeamEstimate, estimate_beam
 from .corrections import fit_veil, floored_line_integrals, refined_scatter
 from .ct_numbers import hounsfield
 from .dead_pixels import filled
@@ -37,6 +38,7 @@ from .workflow import IterativeResult, reconstruct
 
 __all__ = [
     "PWLS",
+    "BeamEstimate",
     "BeamModel",
     "FDKConfig",
     "IterativeResult",
@@ -53,6 +55,7 @@ __all__ = [
     "component_path_lengths",
     "component_shares",
     "coverage",
+    "estimate_beam",
     "fdk",
     "field_of_view_grid",
     "filled",

@@ -3,6 +3,7 @@
 Each function returns a matplotlib `Figure` of its own; nothing touches pyplot's state or a screen.
 """
 
+from .beam import beam_figure
 from .capture import capture_figure
 from .case import case_figure
 from .comparison import comparison_figure
@@ -16,6 +17,7 @@ from .reconstruction import reconstruction_figure
 from .series import series_figure
 
 __all__ = [
+    "beam_figure",
     "capture_figure",
     "case_figure",
     "comparison_figure",
