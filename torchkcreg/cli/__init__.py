@@ -14,6 +14,7 @@ from torchkcreg.console import one_line, run_command
 
 from .command import add_command
 from .compare import add_compare
+from .densitometry import add_densitometry
 from .experiment import add_experiment
 from .load import add_load
 from .plan import add_plan
@@ -55,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_warp(commands)
     _add_evaluate(commands)
     add_load(commands)
+    add_densitometry(commands)
     add_compare(commands)
     add_plan(commands)
     add_simulate(commands)

@@ -2,6 +2,7 @@
 
 from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
 from .beads import Beads, find_beads
+from .densitometry import MineralContent, calcium_of, mineral_content
 from .displacement import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
 from .fragments import Fragments, fragments_of
@@ -17,12 +18,14 @@ __all__ = [
     "DisplacementMap",
     "DistanceStatistics",
     "Fragments",
+    "MineralContent",
     "PointMetrics",
     "RegionStatistics",
     "RelativeMotion",
     "ShapeEvaluation",
     "align_to_surface",
     "bb_rmse",
+    "calcium_of",
     "cylinder_region",
     "displacement_map",
     "distance_statistics",
@@ -34,6 +37,7 @@ __all__ = [
     "fragments_of",
     "frame_changes",
     "full_width_at_half_maximum",
+    "mineral_content",
     "nearest_node_distances",
     "nearest_node_floor",
     "point_errors",

@@ -3,6 +3,7 @@
 from torchkcreg.experiments.capture import CaptureStudy, CaptureTrial, capture_study
 from torchkcreg.experiments.compare_files import Comparison, compare_files
 from torchkcreg.experiments.demo import demo
+from torchkcreg.experiments.densitometry_files import densitometry_files
 from torchkcreg.experiments.describe import describe, describe_installation
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
@@ -32,6 +33,7 @@ __all__ = [
     "capture_study",
     "compare_files",
     "demo",
+    "densitometry_files",
     "describe",
     "describe_installation",
     "draw_registration",

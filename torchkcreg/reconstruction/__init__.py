@@ -12,6 +12,7 @@ from .beam_estimate import BeamEstimate, estimate_beam
 from .corrections import fit_veil, floored_line_integrals, refined_scatter
 from .ct_numbers import hounsfield
 from .dead_pixels import filled
+from .decomposition import Decomposition, decompose
 from .fdk import FDKConfig, fdk
 from .field_of_view import coverage, field_of_view_grid
 from .inpainting import inpainted
@@ -40,6 +41,7 @@ __all__ = [
     "PWLS",
     "BeamEstimate",
     "BeamModel",
+    "Decomposition",
     "FDKConfig",
     "IterativeResult",
     "KnownComponent",
@@ -55,6 +57,7 @@ __all__ = [
     "component_path_lengths",
     "component_shares",
     "coverage",
+    "decompose",
     "estimate_beam",
     "fdk",
     "field_of_view_grid",

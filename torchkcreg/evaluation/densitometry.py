@@ -1,0 +1,97 @@
+"""Bone mineral in regions of a reconstruction: calcium in mg/mL out of attenuation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchkcreg.geometry import VolumeGrid
+from torchkcreg.physics import calcium_in_water, material
+
+CALCIUM_IN_HYDROXYAPATITE = 0.3989  # by mass, of Ca10(PO4)6(OH)2
+_LINEAR = 100.0  # mg/mL; attenuation is linear in the concentration
+
+
+@dataclass(frozen=True)
+class MineralContent:
+    """What a region holds.
+
+    Attributes:
+        name: Of the region.
+        num_voxels: How many voxels count: those of the region that are far enough from metal.
+        left_out: Share of the region's voxels that are not.
+        volume_ml: Theirs.
+        calcium_mg_ml: Mean concentration of calcium.
+        std_mg_ml: Standard deviation of the voxels about it.
+    """
+
+    name: str
+    num_voxels: int
+    left_out: float
+    volume_ml: float
+    calcium_mg_ml: float
+    std_mg_ml: float
+
+    @property
+    def hydroxyapatite_mg_ml(self) -> float:
+        """The same calcium as hydroxyapatite, which phantoms and scanners of bone are calibrated in."""
+        return self.calcium_mg_ml / CALCIUM_IN_HYDROXYAPATITE
+
+    @property
+    def content_mg(self) -> float:
+        """Hydroxyapatite in all of the counted volume."""
+        return self.hydroxyapatite_mg_ml * self.volume_ml
+
+
+def calcium_of(attenuation: Tensor, reference_kev: float) -> Tensor:
+    """Calcium in mg/mL of attenuation in 1/mm at an energy, of voxels that are water and calcium alone.
+
+    >>> round(float(calcium_of(calcium_in_water(150).attenuation((60.0,)), 60.0)))
+    150
+    """
+    water = float(material("water").attenuation((reference_kev,))[0])
+    per_unit = float(calcium_in_water(_LINEAR).attenuation((reference_kev,))[0]) - water
+    return (attenuation - water) * (_LINEAR / per_unit)
+
+
+def mineral_content(
+    calcium_mg_ml: Tensor, regions: Mapping[str, Tensor], grid: VolumeGrid, *, usable: Tensor | None = None
+) -> list[MineralContent]:
+    """What regions hold of calcium.
+
+    Args:
+        calcium_mg_ml: (D, H, W).
+        regions: Name and voxels (D, H, W), true inside, of each.
+        grid: The voxels.
+        usable: True where voxels may count, such as beyond some distance from metal; all if None.
+
+    Raises:
+        ValueError: If shapes differ, or a region has fewer than two usable voxels.
+    """
+    found = []
+    for name, region in regions.items():
+        if region.shape != calcium_mg_ml.shape or tuple(region.shape) != tuple(grid.shape):
+            raise ValueError(
+                f"region {name} must have the volume's shape {tuple(grid.shape)}, got {tuple(region.shape)}"
+            )
+        whole = region.bool()
+        counted = whole if usable is None else whole & usable
+        values = calcium_mg_ml[counted].double()
+        if len(values) < 2:
+            raise ValueError(f"region {name} has {len(values)} usable voxels of {int(whole.sum())}, too few to measure")
+        if not bool(torch.isfinite(values).all()):
+            raise ValueError(f"region {name} holds values that are not finite")
+        found.append(
+            MineralContent(
+                name,
+                len(values),
+                1 - len(values) / int(whole.sum()),
+                len(values) * grid.voxel_volume / 1000,
+                float(values.mean()),
+                float(values.std()),
+            )
+        )
+    return found
