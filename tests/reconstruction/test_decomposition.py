@@ -55,7 +55,7 @@ def test_rods_are_recovered_beside_a_plate(scan):
         region = cylinder_region(GRID, (*place, -9.0), (*place, 9.0), 3.5)
         calcium = region_statistics(found.calcium_mg_ml, region)
         assert calcium.mean == pytest.approx(float(name[2:]), abs=7), name  # noise of a small region
-        assert region_statistics(found.water, region).mean == pytest.approx(1.0, abs=0.02)
+        assert region_statistics(found.water, region).mean == pytest.approx(1.0, abs=0.04)
         assert region_statistics(found.single_mg_ml, region).mean == pytest.approx(float(name[2:]), abs=8)
     assert found.history[-1] < found.history[0] < 0.03
     assert found.mask is not None and float(found.water.min()) >= 0

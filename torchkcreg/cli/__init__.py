@@ -154,6 +154,8 @@ def _add_reconstruct(commands) -> None:
     command.add_argument("--window", help="of the ramp: ram-lak, shepp-logan, cosine, hamming or hann (default)")
     command.add_argument("--scatter", help="auto (default), run (as found), none, or its fraction")
     command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")
+    streamed = "read some views at a time, of scans larger than memory (fdk and kcmar; NPY, uncompressed MHA)"
+    command.add_argument("--stream", action="store_true", default=None, help=streamed)
     estimated = "given (default), or estimate: out of the metal's shadow, where spectrum or alloy are not known"
     command.add_argument("--beam", choices=("given", "estimate"), help=estimated)
     command.add_argument("--material", help="of the implant, where the registration had none")

@@ -11,7 +11,7 @@ from torchkcreg.experiments.implant_of_run import implant_of_run
 from torchkcreg.experiments.load_files import ImplantLoad, load_files
 from torchkcreg.experiments.plan_files import ViewPlan, plan_files
 from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
-from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles, ReconstructionOptions
+from torchkcreg.experiments.reconstruction_options import ReconstructionFiles, ReconstructionOptions
 from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
 from torchkcreg.experiments.registered_components import registered_components
 from torchkcreg.experiments.runs_compared import runs_compared

@@ -15,30 +15,22 @@ from torchkcreg.io import RunFolder, read_config, read_volume, write_volume
 from torchkcreg.physics import material
 from torchkcreg.reconstruction import (
     PWLS,
-    BeamModel,
     FDKConfig,
     PWLSConfig,
     Veil,
     ViewShard,
-    component_path_lengths,
     fdk,
     hounsfield,
-    inpainted,
     known_materials,
-    path_lengths_through,
-    prepare,
     reconstruct,
     with_components,
 )
 from torchkcreg.visualization import beam_figure, reconstruction_figure
 
+from .filtered_lines import line_integrals, streamed
 from .processes import processes
-from .reconstruction_inputs import (
-    ReconstructionFiles,
-    ReconstructionInputs,
-    ReconstructionOptions,
-    read_reconstruction_inputs,
-)
+from .reconstruction_inputs import ReconstructionInputs, read_reconstruction_inputs
+from .reconstruction_options import ReconstructionFiles, ReconstructionOptions
 
 CHECKPOINT_EVERY = 5
 OUTPUTS = ("volume.mha", "volume_hu.mha", "with_implant.mha", "slices.png", "beam.png")
@@ -109,7 +101,8 @@ def _reconstructed(
     geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
     if options.is_filtered:
         ramp = FDKConfig(window=options.window)
-        return fdk(_line_integrals(inputs, options), geometry, grid, config=ramp, shard=shard, backend=backend), []
+        lines = line_integrals(inputs, options) if inputs.file is None else streamed(inputs, options)
+        return fdk(lines, geometry, grid, config=ramp, shard=shard, backend=backend), []
     changes = {name: getattr(options, name) for name in ("iterations", "subsets") if getattr(options, name) is not None}
     config = PWLSConfig.preset(options.preset, beta=options.beta, **changes)
     initial = None
@@ -137,19 +130,6 @@ def _reconstructed(
         progress=None if run is not None else False,
     )
     return result.volume, result.history
-
-
-def _line_integrals(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Tensor:
-    """What FDK takes: line integrals, around known metal, or path lengths where the object is of one material alone."""
-    alone = options.single_material
-    beam = inputs.beam.without_metals() if alone is None else BeamModel.monoenergetic([])
-    lines = prepare(inputs.transmission, inputs.geometry, beam, scatter=inputs.scatter, mask=inputs.mask).line_integrals
-    if alone is not None:
-        return path_lengths_through(torch.exp(-lines), material(alone), inputs.spectrum)
-    if not inputs.components:
-        return lines
-    metal = component_path_lengths(inputs.components, inputs.geometry, backend=options.backend)
-    return inpainted(lines, metal, mask=inputs.mask)
 
 
 class _Checkpoints(Callback):

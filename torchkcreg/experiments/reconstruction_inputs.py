@@ -5,15 +5,12 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
-from torchkcreg.config import Config
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
-from torchkcreg.io import read_config, read_geometry, read_projections, read_run, read_spectrum
+from torchkcreg.io import ProjectionFile, read_config, read_geometry, read_projections, read_run, read_spectrum
 from torchkcreg.physics import Spectrum, material, tungsten_spectrum
 from torchkcreg.reconstruction import (
     BeamEstimate,
@@ -27,90 +24,11 @@ from torchkcreg.reconstruction import (
     known_materials,
 )
 
+from .reconstruction_options import ReconstructionFiles, ReconstructionOptions
 from .registered_components import registered_components
 
+SAMPLE_VIEWS = 20  # of a scan that is streamed, for what is told from all views
 ALLOYS = ("titanium", "steel", "cocr")  # of which an implant is that nobody named
-
-
-@dataclass(frozen=True)
-class ReconstructionFiles:
-    """The files of a reconstruction; what is not given comes from the run.
-
-    Attributes:
-        run: Folder of a finished registration: the implant in its place.
-        geometry: Projection matrices.
-        projections: Intensities or line integrals of all views.
-        spectrum: Detected spectrum.
-        components: Screws to take instead of the run's.
-        open_beam: Unattenuated intensity where the projections' file does not say it.
-        initial: Volume to start PWLS from.
-    """
-
-    run: Path | None = None
-    geometry: Path | None = None
-    projections: Path | None = None
-    spectrum: Path | None = None
-    components: Path | None = None
-    open_beam: float | None = None
-    initial: Path | None = None
-
-
-class ReconstructionOptions(Config):
-    """Options of a reconstruction; unknown keys are refused.
-
-    Attributes:
-        method: "fdk"; "pwls"; "kcrec", PWLS of what the registered implant leaves.
-        spacing_mm: Edge of a voxel.
-        size_mm: Size (x, y, z) of the volume; the field of view if None.
-        center_mm: Its middle (x, y, z), where a size is given.
-        preset: "momentum" or "paper" (500 iterations of 20 subsets).
-        iterations: Overrides the preset's.
-        subsets: Overrides the preset's.
-        beta: Weight of the roughness.
-        passes: Of the iterative methods; from the second on, mineral's hardening and the scatter in the metal's shadow
-            are known from the pass before. None: two of "kcrec", which needs both, one of "pwls".
-        window: Of the ramp.
-        scatter: "auto" fits a smooth one to the air around the object; "run" is what the registration found, of both
-            kinds; "none"; or its fraction of the primary.
-        scatter_sigma_mm: How broad a given fraction's scatter is.
-        monoenergetic: One energy, as in the paper, even where a spectrum is known.
-        beam: "given" is the spectrum of the file and the materials of the run, or a likely one; "estimate" is what the
-            metal's shadow tells of a spectrum, or an implant's material, that nobody knows (methods with components).
-        material: The implant's, where the registration had none.
-        single_material: What the object is of, where it is of one material alone, such as an implant on a bench: "fdk"
-            gives the share of it in each voxel, without beam hardening.
-        backend: Projector: "auto", "cpp" or "torch".
-    """
-
-    method: Literal["fdk", "pwls", "kcrec", "kcmar"] = "fdk"
-    spacing_mm: float = Field(0.8, gt=0)
-    size_mm: tuple[float, float, float] | None = None
-    center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    preset: Literal["momentum", "paper"] = "momentum"
-    iterations: int | None = Field(None, ge=1)
-    subsets: int | None = Field(None, ge=1)
-    beta: float = Field(10.0, ge=0)
-    passes: int | None = Field(None, ge=1)
-    window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = "hann"
-    scatter: Literal["auto", "run", "none"] | float = "auto"
-    scatter_sigma_mm: float = Field(40.0, gt=0)
-    monoenergetic: bool = False
-    beam: Literal["given", "estimate"] = "given"
-    material: str | None = None
-    single_material: str | None = None
-    backend: Literal["auto", "cpp", "torch"] = "auto"
-
-    @property
-    def is_filtered(self) -> bool:
-        """Whether it is a filtered back-projection, without iterations."""
-        return self.method in ("fdk", "kcmar")
-
-    @property
-    def num_passes(self) -> int:
-        """Passes that are made."""
-        if self.passes is not None:
-            return self.passes
-        return 2 if self.method == "kcrec" else 1
 
 
 @dataclass(frozen=True)
@@ -126,6 +44,7 @@ class ReconstructionInputs:
         scatter: Smooth scatter, or an image of it in units of the open beam; None for none.
         spectrum: As detected; a likely one where no file says it.
         estimate: What was estimated of the beam, where that was asked for.
+        file: Where the views are that are not in `transmission`, which then are a sample of them; None if all are.
         components: The metal in its place; none but for "kcrec" and "kcmar".
     """
 
@@ -138,6 +57,15 @@ class ReconstructionInputs:
     spectrum: Spectrum
     components: list[KnownComponent]
     estimate: BeamEstimate | None = None
+    file: ProjectionFile | None = None
+
+    def of_views(self, views: list[int]) -> ReconstructionInputs:
+        """The same of some views, read from the file."""
+        if self.file is None:
+            raise ValueError("all views are at hand")
+        part = self.file.read(views)
+        transmission = torch.exp(-filled(part.line_integrals, part.mask))
+        return replace(self, geometry=self.geometry.select(views), transmission=transmission, mask=part.mask, file=None)
 
 
 def read_reconstruction_inputs(files: ReconstructionFiles, options: ReconstructionOptions) -> ReconstructionInputs:
@@ -151,8 +79,13 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     if files.geometry is None or files.projections is None:
         raise ValueError("a reconstruction needs geometry and projections, or a run that names them")
     geometry = read_geometry(files.geometry)
-    projections = read_projections(files.projections, open_beam=files.open_beam)
-    projections.check_against(geometry)
+    file = _file(files.projections, files.open_beam, geometry, options) if options.stream else None
+    if file is None:
+        projections, shown = read_projections(files.projections, open_beam=files.open_beam), geometry
+    else:
+        sample = sorted({round(i * (len(file) - 1) / (SAMPLE_VIEWS - 1)) for i in range(SAMPLE_VIEWS)})
+        projections, shown = file.read(sample), geometry.select(sample)
+    projections.check_against(shown)
     components, named = [], options.material
     if options.method in ("kcrec", "kcmar"):
         if files.run is None:
@@ -178,7 +111,7 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     if options.scatter == "run" and files.run is not None:
         scatter = read_run(files.run).scatter(transmission, geometry, mask=projections.mask)
     else:
-        scatter = _scatter(transmission, projections.mask, geometry, options, saturated=projections.num_saturated > 0)
+        scatter = _scatter(transmission, projections.mask, shown, options, saturated=projections.num_saturated > 0)
     grid, estimate = _grid(geometry, options), None
     if options.beam == "estimate":
 
@@ -209,7 +142,21 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         spectrum or tungsten_spectrum(),
         components,
         estimate,
+        file,
     )
+
+
+def _file(
+    path: Path, open_beam: float | None, geometry: ConeBeamGeometry, options: ReconstructionOptions
+) -> ProjectionFile:
+    if not options.is_filtered:
+        raise ValueError(f"views are streamed for fdk and kcmar; {options.method} goes through them many times")
+    if options.scatter == "run" or options.beam == "estimate":
+        raise ValueError("the run's scatter, or an estimated beam, need all views at once: leave out stream")
+    file = ProjectionFile(path, open_beam=open_beam)
+    if len(file) != geometry.num_views:
+        raise ValueError(f"projections file {path} has {len(file)} views, the geometry has {geometry.num_views}")
+    return file
 
 
 def _completed(files: ReconstructionFiles) -> ReconstructionFiles:

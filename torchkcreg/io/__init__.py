@@ -13,6 +13,7 @@ from .init import read_init, write_init
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
 from .plausible import implausible_magnification
 from .points import read_points, write_points
+from .projection_file import ProjectionFile
 from .projections import Projections, read_projections, write_projections
 from .references import read_reference
 from .runs import RunFolder, read_run
@@ -23,6 +24,7 @@ from .volumes import read_volume, write_volume
 from .vtu import write_surface_vtu
 
 __all__ = [
+    "ProjectionFile",
     "Projections",
     "RunFolder",
     "displacement_field",

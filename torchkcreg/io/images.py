@@ -3,13 +3,42 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import SimpleITK as sitk
+from numpy.typing import NDArray
 
 _MOST_PACKED = 5000  # how many times larger than its file an image can be: deflate and LZW pack less
 _SMALLEST = 1 << 16  # bytes: what is not worth the question
 _DETACHED = (".mhd", ".nhdr")  # headers whose data are in another file
+
+
+def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
+    """Slices of a volume, in this order, without reading the others where the format allows: uncompressed ones.
+
+    Raises:
+        RuntimeError: It cannot be read.
+    """
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(path))
+    reader.ReadImageInformation()
+    cols, rows = reader.GetSize()[:2]
+    found = []
+    for number in slices:
+        reader.SetExtractIndex([0, 0, number])
+        reader.SetExtractSize([cols, rows, 1])
+        found.append(sitk.GetArrayFromImage(reader.Execute())[0])
+    return np.stack(found)
+
+
+def num_slices(path: Path) -> int:
+    """How many slices a volume has, by its header."""
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(path))
+    reader.ReadImageInformation()
+    return (*reader.GetSize(), 1)[2]
 
 
 def read_image(path: Path) -> sitk.Image:

@@ -47,7 +47,7 @@ class Projections:
 
     def select(self, views: Sequence[int]) -> Projections:
         """The given views alone, in the given order; the counts stay those of the whole."""
-        _check_views(views, len(self.line_integrals))
+        check_views(views, len(self.line_integrals))
         index = list(views)
         return replace(self, line_integrals=self.line_integrals[index], mask=self.mask[index])
 
@@ -107,7 +107,7 @@ def read_projections(
     path = existing_file(path, "projections")
     try:
         arrays, header = _load(path)
-        projections = _convert(arrays, open_beam, saturation, views)
+        projections = converted(arrays, open_beam, saturation, views)
         doubts = implausible_images(projections.line_integrals, projections.mask)
     except ValueError as error:
         raise ValueError(f"projections file {path}: {error}") from error
@@ -158,9 +158,10 @@ def _load(path: Path) -> tuple[dict[str, NDArray], ImageHeader | None]:
         raise ValueError(f"cannot be read: {reason[0]}") from error
 
 
-def _convert(
+def converted(
     arrays: dict[str, NDArray], open_beam: ArrayLike | None, saturation: float | None, views: Sequence[int] | None
 ) -> Projections:
+    """What a file's arrays hold, by their names; an "image" is intensity where there is an open beam."""
     beam = arrays.get("open_beam") if open_beam is None else np.asarray(open_beam)
     if "image" in arrays:
         arrays["line_integrals" if beam is None else "intensity"] = arrays.pop("image")
@@ -176,7 +177,7 @@ def _convert(
     mask = kept != 0
     beam = None if beam is None else _open_beam(beam, image.shape)
     if views is not None:
-        _check_views(views, len(image))
+        check_views(views, len(image))
         index = list(views)
         image, mask = image[index], mask[index]
         beam = beam[index] if beam is not None and len(beam) > 1 else beam
@@ -244,7 +245,8 @@ def _open_beam(beam: NDArray, shape: tuple[int, ...]) -> NDArray:
     return beam.reshape((1,) * (3 - beam.ndim) + beam.shape)
 
 
-def _check_views(views: Sequence[int], num_views: int) -> None:
+def check_views(views: Sequence[int], num_views: int) -> None:
+    """Nothing; ValueError where there are no views, or one that does not exist."""
     if len(views) == 0:
         raise ValueError("views must name at least one view")
     for view in views:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -80,8 +81,8 @@ def columns_and_rows(frame: AxialFrame, det_shape: tuple[int, int]) -> tuple[Ten
     return linear[:, 0, :1] * u + linear[:, 0, 2:], linear[:, 1, 1:2] * v + linear[:, 1, 2:]
 
 
-def rectified(projections: Tensor, geometry: ConeBeamGeometry) -> tuple[Tensor, ConeBeamGeometry]:
-    """Projections (..., V, rows, cols) resampled onto virtual detectors, and the geometry of these.
+def rectified(geometry: ConeBeamGeometry) -> tuple[ConeBeamGeometry, Callable[[Tensor, Sequence[int]], Tensor]]:
+    """The geometry of virtual detectors, and what resamples images (..., v, rows, cols) of some views onto them.
 
     For tilted detectors: FDK filters along lines across the axis. The virtual detectors have the mean pixel of the real
     ones and hold all of them; beyond its border an image goes on with its last pixels.
@@ -97,17 +98,21 @@ def rectified(projections: Tensor, geometry: ConeBeamGeometry) -> tuple[Tensor, 
     zeta = low[1] + pitch[1] * torch.arange(counts[1], dtype=torch.float64, device=low.device)
     virtual = torch.stack([*torch.meshgrid(p, zeta, indexing="xy"), torch.ones(counts[::-1]).to(p)], dim=-1)
     back = torch.linalg.inv(frame.to_virtual)
-    images = []
-    for view in range(geometry.num_views):
-        pixels = virtual @ back[view].mT
-        size = pixels.new_tensor([cols, rows])
-        places = (2 * pixels[..., :2] / pixels[..., 2:] + 1) / size - 1
-        image = projections[..., view, :, :].reshape(1, -1, rows, cols)
-        sampled = grid_sample(
-            image, places[None].to(image), mode="bilinear", padding_mode="border", align_corners=False
-        )
-        images.append(sampled.reshape(*projections.shape[:-3], *counts[::-1]))
-    return torch.stack(images, dim=-3), _virtual_geometry(geometry, frame, low, high, pitch, counts)
+
+    def resampled(images: Tensor, views: Sequence[int]) -> Tensor:
+        found = []
+        for number, view in enumerate(views):
+            pixels = virtual @ back[view].mT
+            size = pixels.new_tensor([cols, rows])
+            places = (2 * pixels[..., :2] / pixels[..., 2:] + 1) / size - 1
+            image = images[..., number, :, :].reshape(1, -1, rows, cols)
+            sampled = grid_sample(
+                image, places[None].to(image), mode="bilinear", padding_mode="border", align_corners=False
+            )
+            found.append(sampled.reshape(*images.shape[:-3], *counts[::-1]))
+        return torch.stack(found, dim=-3)
+
+    return _virtual_geometry(geometry, frame, low, high, pitch, counts), resampled
 
 
 def _virtual_geometry(

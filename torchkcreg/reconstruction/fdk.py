@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -19,6 +21,8 @@ from .redundancy import AngularSampling, angular_sampling, full_scan_weights, is
 from .sharding import ViewShard
 
 BLOCK_VIEWS = 16  # filtered together, to bound memory
+
+Views = Callable[[list[int]], Tensor]  # reads the images of some views
 
 
 class FDKConfig(Config):
@@ -39,7 +43,7 @@ class FDKConfig(Config):
 
 
 def fdk(
-    projections: Tensor,
+    projections: Tensor | Views,
     geometry: ConeBeamGeometry,
     grid: VolumeGrid,
     *,
@@ -59,7 +63,9 @@ def fdk(
     spots they are mixed linearly, as far as each sees the voxel. So the cone angle stays small over the whole height.
 
     Args:
-        projections: line integrals; masked pixels must hold a sensible value.
+        projections: line integrals (..., V, rows, cols); masked pixels must hold a sensible value. Or a function that
+            gives those of a list of views, (v, rows, cols): of a scan that is larger than memory, each view is asked
+            for once.
         geometry: the views; a gantry that does not turn about the world's z axis is brought there by `moved`.
         grid: the voxels.
         config: window, extrapolation, how focal spots combine.
@@ -77,21 +83,24 @@ def fdk(
     0.0
     """
     config = config or FDKConfig()
-    check_projections(projections, geometry)
+    if isinstance(projections, Tensor):
+        check_projections(projections, geometry)
+    images = projections
+    read = images if callable(images) else lambda views: images[..., views, :, :]
     seen = coverage(geometry, grid)
     if not bool((seen > 0).any()):
         raise ValueError("grid lies outside the field of view: no view sees any of its voxels")
     groups = views_by_source(geometry) if config.combine else [list(range(geometry.num_views))]
     if len(groups) == 1:
-        return _single_spot(projections, geometry, grid, config, shard, backend)
+        return _single_spot(read, geometry, grid, config, shard, backend)
     parts = [geometry.select(views) for views in groups]
-    shares = height_shares(parts, grid).to(projections)
-    total = projections.new_zeros(*projections.shape[:-3], *grid.shape)
+    shares, volumes = height_shares(parts, grid), []
     for views, part, share in zip(groups, parts, shares, strict=True):
         own = shard.within(views) if shard is not None else None
-        volume = _single_spot(projections[..., views, :, :], part, grid, config, own, backend)
-        total += volume.mul_(share)
-    return total
+        of_spot = lambda block, views=views: read([views[i] for i in block])  # noqa: E731
+        volume = _single_spot(of_spot, part, grid, config, own, backend)
+        volumes.append(volume.mul_(share.to(volume)))
+    return torch.stack(volumes).sum(0)
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ class _Plan:
 
 
 def _single_spot(
-    projections: Tensor,
+    read: Views,
     geometry: ConeBeamGeometry,
     grid: VolumeGrid,
     config: FDKConfig,
@@ -121,15 +130,22 @@ def _single_spot(
 ) -> Tensor:
     """FDK of the views of one focal spot."""
     sampling = angular_sampling(axial_frame(geometry).angles.cpu())
-    if not is_aligned(axial_frame(geometry), geometry.det_shape):
-        projections, geometry = rectified(projections, geometry)
+    is_tilted, measured = not is_aligned(axial_frame(geometry), geometry.det_shape), geometry
+    if is_tilted:
+        geometry, resampled = rectified(geometry)
     plan = _plan(geometry, sampling, config)
     views = list(range(geometry.num_views)) if shard is None else shard.views
-    volume = projections.new_zeros(*projections.shape[:-3], *grid.shape)
+    volume = None
     for start in range(0, len(views), BLOCK_VIEWS):
         block = views[start : start + BLOCK_VIEWS]
-        filtered = _filtered(projections[..., block, :, :], plan, block, config)
-        volume += backproject_weighted(filtered, grid, plan.matrices[block], backend=backend)
+        images = read(block)
+        check_projections(images, measured, len(block))
+        filtered = _filtered(resampled(images, block) if is_tilted else images, plan, block, config)
+        part = backproject_weighted(filtered, grid, plan.matrices[block], backend=backend)
+        volume = part if volume is None else volume.add_(part)
+    if volume is None:  # more processes than views
+        images = read([0])
+        volume = images.new_zeros(*images.shape[:-3], *grid.shape)
     return volume if shard is None else shard.sum(volume)
 
 
@@ -167,9 +183,9 @@ def _filtered(images: Tensor, plan: _Plan, views: list[int], config: FDKConfig) 
     return filtered * (pitch / pitches)[:, None, None].to(images)  # the ramp scales with one over the pitch
 
 
-def check_projections(projections: Tensor, geometry: ConeBeamGeometry) -> None:
-    """Nothing; ValueError unless projections are finite numbers of the geometry's views and detector."""
-    expected = (geometry.num_views, *geometry.det_shape)
+def check_projections(projections: Tensor, geometry: ConeBeamGeometry, num_views: int | None = None) -> None:
+    """Nothing; ValueError unless projections are finite numbers of the geometry's views, or so many, and detector."""
+    expected = (geometry.num_views if num_views is None else num_views, *geometry.det_shape)
     if projections.dim() < 3 or tuple(projections.shape[-3:]) != expected:
         raise ValueError(
             f"projections must have shape (..., V, rows, cols) = {expected}, got {tuple(projections.shape)}"

@@ -13,7 +13,7 @@ import yaml
 
 from torchkcreg.experiments.inputs import RegistrationFiles
 from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options
-from torchkcreg.experiments.reconstruction_inputs import ReconstructionFiles
+from torchkcreg.experiments.reconstruction_options import ReconstructionFiles
 from torchkcreg.experiments.register_files import register_files
 from torchkcreg.experiments.simulate_files import simulate_files
 from torchkcreg.geometry import MultisourceScanner, rigid_matrix
