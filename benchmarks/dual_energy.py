@@ -24,8 +24,8 @@ from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import reconstruction_figure
 
 ABOUT = """A bath of 68 mm with rods of 50, 100 and 200 mg/mL of calcium and a plate of 30 x 4 x 16 mm; 180 views of
-96 x 40 pixels of 1.2 mm, 70 and 120 kV in turns, 60 000 quanta. In the second scan the bath is lighter than water, which one
-voltage takes for a lack of calcium. "One attenuation" is KC-Rec of the same data."""
+96 x 40 pixels of 1.2 mm, 70 and 120 kV in turns, 60 000 quanta. In the second scan the bath is lighter than water,
+which one voltage takes for a lack of calcium. "One attenuation" is KC-Rec of the same data."""
 VIEWS = 180
 SPECTRA = {"low": tungsten_spectrum(70), "high": tungsten_spectrum(120)}
 GRID = VolumeGrid.centered((36, 64, 64), 1.2)
