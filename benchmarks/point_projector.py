@@ -273,7 +273,13 @@ def draw(rows: list, path: Path) -> None:
         points = [(error, seconds, name) for s, name, _, seconds, error in chosen if s == step]
         axes.scatter([p[0] for p in points], [p[1] for p in points], marker=marker, label=step)
         for error, seconds, name in points if step == "and back" else ():
-            axes.annotate(name, (error, seconds), xytext=(6, 4), textcoords="offset points", fontsize=8)
+            axes.annotate(
+                name,
+                (error, seconds),
+                xytext=(6, -12 if name == "torchkcreg" else 4),
+                textcoords="offset points",
+                fontsize=8,
+            )
     axes.set(xscale="symlog", yscale="log", xlabel="error, % RMS", ylabel=f"seconds, {most} threads")
     axes.set_xlim(left=-0.1, right=10 ** math.ceil(math.log10(max(row[4] for row in chosen)) + 0.5))
     axes.legend(frameon=False, loc="lower right")

@@ -57,7 +57,8 @@ class BeamEstimate:
         scales: Attenuation of each over that of the packaged alloy.
         scatter_scale: How much more scatter there is behind the metal than was told.
         lengths_mm: Path lengths (M, N) of the pixels that were used.
-        measured: Their primary transmissions (N,), without the background's.
+        measured: What the metal alone let through in them (N,): the measured over the modelled primary, times the
+            metal's own.
         residual: Root mean square of what is left of the primary, in standard deviations.
         cost: What was minimised, half a sum of squares: by so much other voltages and alloys were less likely.
     """
@@ -217,10 +218,12 @@ def _fitted(shadow: _Shadow, spectrum: Spectrum, kvp: float | None, metals: Sequ
         weights = np.exp(logs - hardness * aluminium)
         return weights / weights.sum()
 
-    def left(x: np.ndarray) -> np.ndarray:
+    def passed(x: np.ndarray, behind: np.ndarray) -> np.ndarray:
         metal = np.einsum("m,me,mn->en", x[2:], attenuation, lengths)
-        passed = shares(x[0]) @ np.exp(-metal - ratio[:, None] * background)
-        return (passed + x[1] * scatter - primary) / deviation
+        return shares(x[0]) @ np.exp(-metal - ratio[:, None] * behind)
+
+    def left(x: np.ndarray) -> np.ndarray:
+        return (passed(x, background) + x[1] * scatter - primary) / deviation
 
     def tissue(x: np.ndarray) -> float:
         """Its attenuation over water, whose logarithm changes with the beam as a typical line integral's does."""
@@ -246,7 +249,7 @@ def _fitted(shadow: _Shadow, spectrum: Spectrum, kvp: float | None, metals: Sequ
         tuple(float(s) for s in found[2:]),
         1 + float(found[1]),
         shadow.lengths,
-        (shadow.primary - found[1] * shadow.scatter) * shadow.background.exp(),
+        torch.from_numpy((primary - found[1] * scatter) / passed(found, background) * passed(found, 0 * background)),
         float(np.sqrt(np.mean(left(found) ** 2))),
         float(fit.cost),
     )
