@@ -8,8 +8,8 @@ import torch
 import trimesh
 
 from torchkcreg.geometry import VolumeGrid, circular_geometry
-from torchkcreg.physics import material, tungsten_spectrum
-from torchkcreg.reconstruction import BeamModel, KnownComponent, estimate_beam
+from torchkcreg.physics import Beam, material, tungsten_spectrum
+from torchkcreg.reconstruction import BeamModel, KnownComponent, component_path_lengths, estimate_beam
 from torchkcreg.simulation import DetectorModel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import beam_figure
@@ -104,3 +104,12 @@ def test_what_tells_nothing_is_refused(scans):
     needle = trimesh.creation.box((0.3, 0.3, 2.0))
     with pytest.raises(ValueError, match="too few to tell the beam: give a spectrum"):
         estimate_beam(transmission, GEOMETRY, GRID, [KnownComponent.from_mesh(needle, "titanium", pitch=0.1)])
+
+
+def test_an_estimate_that_is_unlikely_is_told(scans):
+    with pytest.warns(UserWarning, match="titanium comes out with .* is it another metal"):
+        estimate_beam(scans["steel", 80.0], GEOMETRY, GRID, [component("titanium")], spectrum=tungsten_spectrum(80.0))
+    alone = component_path_lengths([component("titanium")], GEOMETRY)
+    bare = Beam.of([material("titanium")], tungsten_spectrum(90.0)).transmission(alone[None].double())[0].float()
+    with pytest.warns(UserWarning, match="there is no soft tissue around the metal"):
+        estimate_beam(bare, GEOMETRY, GRID, [component("titanium")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,37 +13,25 @@ import numpy as np
 import torch
 from scipy.optimize import brentq, least_squares
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.physics import Beam, Spectrum, Veil, material, tungsten_spectrum, veil_image
 from torchkcreg.scene import KnownComponent
 
-from .corrections import floored_line_integrals
 from .dead_pixels import filled_transmission
-from .fdk import fdk
-from .inpainting import inpainted
-from .known_component import component_path_lengths, known_materials, unknown_share, without_components
+from .known_component import component_path_lengths, known_materials, unknown_share
+from .metal_shadow import MetalShadow, metal_shadow
 from .spectral import BeamModel
-from .system import VoxelSystem
 
 TUBE_KVP = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0)  # packaged spectra, from among which the nearest is taken
 NUM_BINS = 12
-FEWEST_PIXELS = 200
-MOST_PIXELS = 20000
-LEAST_MM = 0.5  # of metal in a pixel that is used
-LEAST_PER_MM = 0.1  # attenuation of the lightest implant alloys, 1/mm, less than that
-STEEPEST = 0.15  # change of the metal's length to the next pixel, as a share: rims are averages of exponentials
-LEAST_TRANSMISSION = 0.003  # below it nothing is left of the beam that tells anything
-BACKGROUND = 0.03  # of a line integral: the interpolated background's error
-NOISE = 2e-3  # of a transmission
 INDEPENDENT = 400  # pixels: what is wrong with the background or the scatter is so over many of them
 # standard deviations of what is likely before the data speak
 HARDNESS_MM = 2.0  # of aluminium, of a scanner's filter beside the packaged spectra's
 SCALE = 0.03  # of an alloy's attenuation
+UNLIKELY = 3.0  # so many of these are told
 SCATTER = 0.05  # of the scatter that was fitted to the air
 TISSUE = 0.02  # of the attenuation of the soft tissue that most of an object is, beside water
-TISSUE_RANGE = (0.85, 1.15)  # of water: what most of an object is beyond that is no soft tissue
 
 
 @dataclass(frozen=True)
@@ -78,20 +67,6 @@ class BeamEstimate:
         """What a record says of it: plain numbers and names."""
         told = ("kvp", "hardness_mm", "alloys", "scales", "scatter_scale", "residual", "cost")
         return {name: getattr(self, name) for name in told}
-
-
-@dataclass(frozen=True)
-class _Shadow:
-    """Pixels behind metal: path lengths (M, N); all others (N,). And what stands around the metal."""
-
-    lengths: Tensor
-    primary: Tensor
-    scatter: Tensor
-    background: Tensor  # its line integrals
-    deviation: Tensor  # of the primary
-    typical: float  # line integral around the metal, as measured
-    tissue: float  # what most of the object is, over water, if the beam is `start`; nan where it is no soft tissue
-    start: BeamModel
 
 
 def estimate_beam(
@@ -138,72 +113,30 @@ def estimate_beam(
     metal = component_path_lengths(components, geometry, backend=backend).to(transmission)
     start = BeamModel.polyenergetic([], spectrum or tungsten_spectrum())
     unknown = unknown_share(components, grid).to(transmission)
-    shadow = _shadow(transmission - veil, veil, metal, unknown, geometry, grid, start, mask, backend)
+    shadow = metal_shadow(transmission - veil, veil, metal, unknown, geometry, grid, start, mask, backend)
     spectra = {None: spectrum} if spectrum is not None else {kvp: tungsten_spectrum(kvp) for kvp in TUBE_KVP}
     metals = list(itertools.product(*(dict.fromkeys([name, *alloys]) for name in known_materials(components))))
     fits = [_fitted(shadow, one, kvp, names) for kvp, one in spectra.items() for names in metals]
-    return min(fits, key=lambda fit: fit.cost)
+    best = min(fits, key=lambda fit: fit.cost)
+    for doubt in _doubts(best, shadow):
+        warnings.warn(f"the estimated beam is doubtful: {doubt}", stacklevel=2)
+    return best
 
 
-def _shadow(
-    primary: Tensor,
-    scatter: Tensor,
-    metal: Tensor,
-    unknown: Tensor,
-    geometry: ConeBeamGeometry,
-    grid: VolumeGrid,
-    beam: BeamModel,
-    mask: Tensor | None,
-    backend: str,
-) -> _Shadow:
-    """Pixels behind smooth metal, and the background in them out of a reconstruction around the metal's shadow."""
-    lines = floored_line_integrals(primary)
-    everything = [(slice(None), beam.weights[:, None, None, None])]
-    around = inpainted(without_components(lines, everything, beam)[0], metal, mask=mask)
-    volume = fdk(around, geometry, grid, backend=backend).clamp_min(0)
-    system = VoxelSystem(geometry, grid, backend=backend)
-    seen, displaced = (
-        torch.cat([system.project(part, range(v, v + 1)) for v in range(geometry.num_views)])
-        for part in (volume, volume * (1 - unknown))
-    )
-    # what the volume lacks is as around the shadow, and where there is metal there is nothing else
-    background = seen + inpainted(around - seen, metal, mask=mask) - displaced
-    total = metal.sum(0)
-    steps = max_pool2d(total[:, None], 3, 1, 1)[:, 0] + max_pool2d(-total[:, None], 3, 1, 1)[:, 0]
-    behind = torch.exp(-background) * torch.exp(-LEAST_PER_MM * total)
-    used = (total > LEAST_MM) & (steps < STEEPEST * total) & (behind > LEAST_TRANSMISSION)
-    if mask is not None:
-        used &= mask != 0
-    places = used.flatten().nonzero()[:, 0]
-    if len(places) < FEWEST_PIXELS:
-        raise ValueError(
-            f"only {len(places)} pixels lie behind smooth metal, too few to tell the beam: give a spectrum"
-        )
-    places = places[:: max(1, len(places) // MOST_PIXELS)]
-    at = lambda image: image.flatten()[places].double()  # noqa: E731
-    expected = at(primary).clamp_min(LEAST_TRANSMISSION)
-    return _Shadow(
-        metal.flatten(1)[:, places].double(),
-        at(primary),
-        at(scatter),
-        at(background),
-        (NOISE**2 + (BACKGROUND * expected) ** 2).sqrt(),
-        float(lines[(total == 0) & (lines > lines.max() / 10)].median()),
-        _tissue(volume, beam.water),
-        beam,
-    )
+def _doubts(found: BeamEstimate, shadow: MetalShadow) -> list[str]:
+    """Why an estimate may be far off."""
+    doubts = []
+    if math.isnan(shadow.tissue):
+        doubts.append("there is no soft tissue around the metal to fix its scale: attenuation may be off as a whole")
+    for alloy, scale in zip(found.alloys, found.scales):
+        if abs(scale - 1) > UNLIKELY * SCALE:
+            doubts.append(f"{alloy} comes out with {scale:.2f} of its attenuation: is it another metal, or misplaced?")
+    if abs(found.hardness_mm) > UNLIKELY * HARDNESS_MM:
+        doubts.append(f"a filter of {found.hardness_mm:.0f} mm of aluminium beside the usual one: give a spectrum")
+    return doubts
 
 
-def _tissue(volume: Tensor, water: float) -> float:
-    """What most of an object is, over water; nan where that is no soft tissue."""
-    low, high = 0.5, 2.0
-    counts = torch.histc(volume / water, bins=150, min=low, max=high)
-    counts = torch.nn.functional.avg_pool1d(counts[None], 5, 1, 2)[0]
-    mode = low + (float(counts.argmax()) + 0.5) * (high - low) / len(counts)
-    return mode if TISSUE_RANGE[0] < mode < TISSUE_RANGE[1] else float("nan")
-
-
-def _fitted(shadow: _Shadow, spectrum: Spectrum, kvp: float | None, metals: Sequence[str]) -> BeamEstimate:
+def _fitted(shadow: MetalShadow, spectrum: Spectrum, kvp: float | None, metals: Sequence[str]) -> BeamEstimate:
     """The hardness and scales that explain the shadow best."""
     water, reference_kev = material("water"), float(shadow.start.reference_kev or 0)
     whole = Beam.of([*(material(name) for name in metals), water], spectrum, num_bins=NUM_BINS)
