@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchkcreg.cli import main
-from torchkcreg.evaluation import calcium_of, mineral_content
+from torchkcreg.evaluation import mineral_content
 from torchkcreg.geometry import VolumeGrid
 from torchkcreg.io import write_json, write_volume
-from torchkcreg.physics import calcium_in_water
+from torchkcreg.physics import calcium_in_water, calcium_of
 
 GRID = VolumeGrid.centered((10, 20, 20), 1.0)
 KEV = 54.0

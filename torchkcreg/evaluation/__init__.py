@@ -2,7 +2,7 @@
 
 from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
 from .beads import Beads, find_beads
-from .densitometry import MineralContent, calcium_of, mineral_content
+from .densitometry import MineralContent, mineral_content
 from .displacement import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
 from .fragments import Fragments, fragments_of
@@ -25,7 +25,6 @@ __all__ = [
     "ShapeEvaluation",
     "align_to_surface",
     "bb_rmse",
-    "calcium_of",
     "cylinder_region",
     "displacement_map",
     "distance_statistics",

@@ -1,4 +1,4 @@
-"""Bone mineral in regions of a reconstruction: calcium in mg/mL out of attenuation."""
+"""Bone mineral in regions of a reconstruction."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid
-from torchkcreg.physics import calcium_in_water, material
 
 CALCIUM_IN_HYDROXYAPATITE = 0.3989  # by mass, of Ca10(PO4)6(OH)2
-_LINEAR = 100.0  # mg/mL; attenuation is linear in the concentration
 
 
 @dataclass(frozen=True)
@@ -44,17 +42,6 @@ class MineralContent:
     def content_mg(self) -> float:
         """Hydroxyapatite in all of the counted volume."""
         return self.hydroxyapatite_mg_ml * self.volume_ml
-
-
-def calcium_of(attenuation: Tensor, reference_kev: float) -> Tensor:
-    """Calcium in mg/mL of attenuation in 1/mm at an energy, of voxels that are water and calcium alone.
-
-    >>> round(float(calcium_of(calcium_in_water(150).attenuation((60.0,)), 60.0)))
-    150
-    """
-    water = float(material("water").attenuation((reference_kev,))[0])
-    per_unit = float(calcium_in_water(_LINEAR).attenuation((reference_kev,))[0]) - water
-    return (attenuation - water) * (_LINEAR / per_unit)
 
 
 def mineral_content(

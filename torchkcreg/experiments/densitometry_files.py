@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchkcreg.evaluation import MineralContent, calcium_of, cylinder_region, distance_to, mineral_content
+from torchkcreg.evaluation import MineralContent, cylinder_region, distance_to, mineral_content
 from torchkcreg.geometry import VolumeGrid
 from torchkcreg.io import read_json, read_volume, write_json
+from torchkcreg.physics import calcium_of
 from torchkcreg.visualization import reconstruction_figure
 
 _METAL = 0.05  # of the largest attenuation that the implant adds: what voxels are metal
@@ -102,9 +103,7 @@ def _labelled(path: Path | None, grid: VolumeGrid) -> dict[str, Tensor]:
     if path is None:
         return {}
     labels, its_grid = read_volume(path)
-    if labels.shape != tuple(grid.shape) or not torch.allclose(
-        its_grid.voxel_to_world, grid.voxel_to_world, atol=1e-3 * min(grid.spacing)
-    ):
+    if labels.shape != tuple(grid.shape) or not its_grid.lies_on(grid):
         raise ValueError(f"label map {path} must lie on the reconstruction's voxels: resample it there")
     numbers = [int(n) for n in labels.unique().tolist() if n > 0]
     if bool((labels != labels.round()).any()) or not numbers:

@@ -110,7 +110,7 @@ def _reconstructed(
         initial, its_grid = read_volume(files.initial)
         if its_grid.shape != grid.shape:
             raise ValueError(f"initial volume {files.initial} has shape {its_grid.shape}, the grid has {grid.shape}")
-        if not torch.allclose(its_grid.voxel_to_world, grid.voxel_to_world, atol=1e-3 * min(grid.spacing)):
+        if not its_grid.lies_on(grid):
             raise ValueError(f"initial volume {files.initial} has the grid's shape, but lies elsewhere in the world")
     result = reconstruct(
         inputs.transmission,

@@ -86,13 +86,14 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         sample = sorted({round(i * (len(file) - 1) / (SAMPLE_VIEWS - 1)) for i in range(SAMPLE_VIEWS)})
         projections, shown = file.read(sample), geometry.select(sample)
     projections.check_against(shown)
-    components, named = [], options.material
+    components, named, result = [], options.material, None
     if options.method in ("kcrec", "kcmar"):
         if files.run is None:
             raise ValueError(f"method {options.method} needs the run of a registration: name it with --run")
-        named = options.material or read_run(files.run).implants[0].material
+        result = read_run(files.run)
+        named = options.material or result.implants[0].material
         likely = ALLOYS[0] if options.beam == "estimate" and named is None else options.material
-        components = registered_components(files.run, components=files.components, material=likely)
+        components = registered_components(files.run, components=files.components, material=likely, result=result)
     elif options.beam == "estimate":
         raise ValueError(f"a beam is estimated behind known metal, which kcrec and kcmar have, not {options.method}")
     if options.beam == "estimate" and options.monoenergetic:
@@ -109,7 +110,7 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     transmission = torch.exp(-filled(projections.line_integrals, projections.mask))
     scatter: Veil | Tensor | None
     if options.scatter == "run" and files.run is not None:
-        scatter = read_run(files.run).scatter(transmission, geometry, mask=projections.mask)
+        scatter = (result or read_run(files.run)).scatter(transmission, geometry, mask=projections.mask)
     else:
         scatter = _scatter(transmission, projections.mask, shown, options, saturated=projections.num_saturated > 0)
     grid, estimate = _grid(geometry, options), None
@@ -128,10 +129,11 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
                 backend=options.backend,
             )
 
-        if named is None:
-            found = dict(zip(known_materials(components), estimated(ALLOYS).alloys, strict=True))
-            components = [replace(component, material=found[component.material]) for component in components]
-        estimate = estimated()
+        estimate = estimated(() if named else ALLOYS)
+        found = dict(zip(known_materials(components), estimate.alloys, strict=True))
+        components = [replace(component, material=found[component.material]) for component in components]
+        if len(set(estimate.alloys)) < len(estimate.alloys):  # two that are one have one factor
+            estimate = estimated()
     return ReconstructionInputs(
         geometry,
         transmission,

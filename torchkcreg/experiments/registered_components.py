@@ -5,11 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchkcreg.io import read_components, read_config, read_mesh, read_run
+from torchkcreg.registration import RegistrationResult
 from torchkcreg.scene import KnownComponent
 
 
 def registered_components(
-    run: Path, *, components: Path | None = None, material: str | None = None, pitch_mm: float | None = None
+    run: Path,
+    *,
+    components: Path | None = None,
+    material: str | None = None,
+    pitch_mm: float | None = None,
+    result: RegistrationResult | None = None,
 ) -> list[KnownComponent]:
     """The implant of a run as it was registered, then its screws, in world mm.
 
@@ -19,12 +25,13 @@ def registered_components(
             each follows the implant near its head.
         material: the implant's, where the registration had none.
         pitch_mm: of the nodes; the registration's if None.
+        result: of the run, where it was read already.
 
     Raises:
         ValueError: nothing says what the implant is made of.
         FileNotFoundError: the run is not finished, or a file it was made from is gone.
     """
-    result, files = read_run(run), read_config(Path(run) / "config.yaml").get("files") or {}
+    result, files = result or read_run(run), read_config(Path(run) / "config.yaml").get("files") or {}
     meshes = [files["implant"]] if isinstance(files["implant"], str) else files["implant"]
     screws = None if components is None else read_components(components)
     if screws is not None and len(meshes) > 1:

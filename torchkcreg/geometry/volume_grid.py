@@ -101,6 +101,10 @@ class VolumeGrid:
         """Transform (4, 4), float64, of world mm to voxel indices in x, y, z order."""
         return torch.linalg.inv(self.voxel_to_world)
 
+    def lies_on(self, other: VolumeGrid) -> bool:
+        """Whether its voxels are where another grid's are, to a thousandth of a voxel."""
+        return torch.allclose(self.voxel_to_world, other.voxel_to_world, atol=1e-3 * min(other.spacing))
+
     def points(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
         """World positions (D, H, W, 3) in mm of the voxel centres."""
         matrix = self.voxel_to_world.to(device)

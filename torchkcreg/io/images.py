@@ -19,11 +19,9 @@ def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
     """Slices of a volume, in this order, without reading the others where the format allows: uncompressed ones.
 
     Raises:
-        RuntimeError: It cannot be read.
+        RuntimeError: It cannot be read, or its header asks for more than the file can hold.
     """
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    reader.ReadImageInformation()
+    reader = _opened(path)
     cols, rows = reader.GetSize()[:2]
     found = []
     for number in slices:
@@ -34,19 +32,17 @@ def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
 
 
 def num_slices(path: Path) -> int:
-    """How many slices a volume has, by its header."""
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    reader.ReadImageInformation()
-    return (*reader.GetSize(), 1)[2]
+    """How many slices a volume has, by its header; raises as `read_slices`."""
+    return (*_opened(path).GetSize(), 1)[2]
 
 
 def read_image(path: Path) -> sitk.Image:
-    """The image of a file.
+    """The image of a file; raises as `read_slices`."""
+    return _opened(path).Execute()
 
-    Raises:
-        RuntimeError: It cannot be read, or its header asks for more than the file can hold.
-    """
+
+def _opened(path: Path) -> sitk.ImageFileReader:
+    """A reader that has read the header, and believes it."""
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     reader.ReadImageInformation()
@@ -54,4 +50,4 @@ def read_image(path: Path) -> sitk.Image:
     file = path.stat().st_size
     if path.suffix.lower() not in _DETACHED and needed > max(_SMALLEST, _MOST_PACKED * file):
         raise RuntimeError(f"its header asks for {needed} values, more than a file of {file} bytes can hold")
-    return reader.Execute()
+    return reader

@@ -6,7 +6,15 @@ from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensi
 from torchkcreg.physics.elastic_constants import ElasticConstants, elastic_constants, is_elastic
 from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission, intensity_from_dict
 from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
-from torchkcreg.physics.materials import Material, calcium_in_water, material, material_names, mixture
+from torchkcreg.physics.materials import (
+    Material,
+    calcium_attenuation,
+    calcium_in_water,
+    calcium_of,
+    material,
+    material_names,
+    mixture,
+)
 from torchkcreg.physics.scatter import Veil, scatter_shapes, scattered_signal, veil_image
 from torchkcreg.physics.spectra import Spectrum, tungsten_spectrum
 from torchkcreg.physics.transmission import transmission
@@ -22,7 +30,9 @@ __all__ = [
     "PolyenergeticTransmission",
     "Spectrum",
     "Veil",
+    "calcium_attenuation",
     "calcium_in_water",
+    "calcium_of",
     "elastic_constants",
     "gaussian_blur",
     "gaussian_kernel",

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+_DISSOLVED = 200.0  # mg/mL of calcium; attenuation is linear in it
 _CALCIUM = re.compile(r"ca(\d+\.?\d*)")
 ALIASES = {
     "316l": "steel",
@@ -164,6 +165,22 @@ def calcium_in_water(concentration_mg_ml: float) -> Material:
     calcium = concentration_mg_ml / 1000
     name = f"calcium_{concentration_mg_ml:g}_mg_ml"
     return mixture(name, {"water": 1.0, "calcium": calcium}, density=1.0 + calcium)
+
+
+def calcium_attenuation(energies_kev: Sequence[float]) -> Tensor:
+    """What each mg/mL of dissolved calcium adds to water's attenuation, 1/mm."""
+    dissolved = calcium_in_water(_DISSOLVED).attenuation(energies_kev)
+    return (dissolved - material("water").attenuation(energies_kev)) / _DISSOLVED
+
+
+def calcium_of(attenuation: Tensor, reference_kev: float) -> Tensor:
+    """Calcium in mg/mL of attenuation in 1/mm at an energy, of what is water and calcium alone.
+
+    >>> round(float(calcium_of(calcium_in_water(150).attenuation((60.0,)), 60.0)))
+    150
+    """
+    water = float(material("water").attenuation((reference_kev,))[0])
+    return (attenuation - water) / float(calcium_attenuation((reference_kev,))[0])
 
 
 def packaged_rows(file_name: str) -> Iterator[list[str]]:

@@ -15,9 +15,10 @@ from scipy.optimize import brentq, least_squares
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
-from torchkcreg.physics import Beam, Spectrum, Veil, material, tungsten_spectrum, veil_image
+from torchkcreg.physics import Beam, Spectrum, Veil, material, tungsten_spectrum
 from torchkcreg.scene import KnownComponent
 
+from .corrections import scatter_image
 from .dead_pixels import filled_transmission
 from .known_component import component_path_lengths, known_materials, unknown_share
 from .metal_shadow import MetalShadow, metal_shadow
@@ -106,10 +107,7 @@ def estimate_beam(
         raise ValueError("a beam is estimated behind known metal, and there are no components")
     if mask is not None:
         transmission = filled_transmission(transmission, mask)
-    veil = scatter
-    if isinstance(veil, Veil):
-        veil = veil_image(transmission, veil, geometry.pixel_spacing)
-    veil = torch.zeros_like(transmission) if veil is None else veil
+    veil = scatter_image(transmission, scatter, geometry.pixel_spacing)
     metal = component_path_lengths(components, geometry, backend=backend).to(transmission)
     start = BeamModel.polyenergetic([], spectrum or tungsten_spectrum())
     unknown = unknown_share(components, grid).to(transmission)
@@ -158,12 +156,12 @@ def _fitted(shadow: MetalShadow, spectrum: Spectrum, kvp: float | None, metals: 
     def left(x: np.ndarray) -> np.ndarray:
         return (passed(x, background) + x[1] * scatter - primary) / deviation
 
+    knows_tissue, start = not math.isnan(shadow.tissue), shadow.start
+    own = _corrected(start.weights.numpy(), start.background.numpy(), shadow.typical) if knows_tissue else 1.0
+
     def tissue(x: np.ndarray) -> float:
         """Its attenuation over water, whose logarithm changes with the beam as a typical line integral's does."""
-        if math.isnan(shadow.tissue):
-            return 1.0
-        own = _corrected(shadow.start.weights.numpy(), shadow.start.background.numpy(), shadow.typical)
-        return shadow.tissue * _corrected(shares(x[0]), ratio, shadow.typical) / own
+        return shadow.tissue * _corrected(shares(x[0]), ratio, shadow.typical) / own if knows_tissue else 1.0
 
     def misfit(x: np.ndarray) -> np.ndarray:
         data = left(x) * math.sqrt(min(1.0, INDEPENDENT / len(primary)))

@@ -11,7 +11,7 @@ from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchkcreg.physics import Veil, gaussian_blur
+from torchkcreg.physics import Veil, gaussian_blur, veil_image
 from torchkcreg.physics.scatter import fixed_point_veil
 
 AIR_TOLERANCE = 0.03
@@ -20,6 +20,13 @@ SHADOW = 0.3  # transmission of metal below which a pixel tells of scatter
 FIT_VIEWS = 20
 FIT_COLUMNS = 24
 SIGMAS_MM = (10.0, 20.0, 30.0, 45.0, 65.0, 100.0)  # where the fit looks first
+
+
+def scatter_image(transmission: Tensor, scatter: Veil | Tensor | None, pixel_spacing: Sequence[float]) -> Tensor:
+    """Scatter in units of the open beam, of the transmission's shape, however it is told; zeros where there is none."""
+    if isinstance(scatter, Veil):
+        return veil_image(transmission, scatter, pixel_spacing)
+    return torch.zeros_like(transmission) if scatter is None else scatter
 
 
 def fit_veil(transmission: Tensor, pixel_spacing: Sequence[float], *, mask: Tensor | None = None) -> Veil:

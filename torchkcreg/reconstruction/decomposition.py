@@ -10,17 +10,17 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
-from torchkcreg.physics import Spectrum, Veil, calcium_in_water, material, veil_image
+from torchkcreg.physics import Spectrum, Veil, calcium_attenuation, calcium_of, material
 from torchkcreg.scene import KnownComponent
 
-from .corrections import floored_line_integrals
+from .corrections import floored_line_integrals, scatter_image
 from .dead_pixels import filled_transmission
 from .known_component import component_shares, known_materials, unknown_share, without_components
 from .pwls import pwls
 from .pwls_config import PWLSConfig
 from .spectral import BeamModel, mineral_part
-from .system import VoxelSystem
-from .two_materials import BLOCK_VIEWS, SpectralViews, TwoMaterials
+from .system import VoxelSystem, projected
+from .two_materials import SpectralViews, TwoMaterials
 from .weights import statistical_weights
 
 CALCIUM_UNIT = 100.0  # mg/mL, in which calcium is solved for: its line integrals then are of the water's size
@@ -88,8 +88,7 @@ def decompose(
     _check(geometry, spectra)
     if mask is not None:
         transmission = filled_transmission(transmission, mask)
-    veil = veil_image(transmission, scatter, geometry.pixel_spacing) if isinstance(scatter, Veil) else scatter
-    veil = torch.zeros_like(transmission) if veil is None else veil
+    veil = scatter_image(transmission, scatter, geometry.pixel_spacing)
     primary = transmission - veil
     lines = floored_line_integrals(primary)
     weights = statistical_weights(primary, scatter=veil, mask=mask) * (primary > LEAST_TRANSMISSION)
@@ -105,8 +104,7 @@ def decompose(
     solver = TwoMaterials(system, lines, weights, sources, unknown, config, grid.spacing, torch.stack([water, calcium]))
     disable = None if progress is None else not progress
     history = [solver.iterate() for _ in tqdm(range(config.iterations), desc="water and calcium", disable=disable)]
-    single = (start - sources[0].beam.water) / _per_calcium(reference) * CALCIUM_UNIT
-    return Decomposition(solver.x[0], solver.x[1] * CALCIUM_UNIT, single, unknown, history)
+    return Decomposition(solver.x[0], solver.x[1] * CALCIUM_UNIT, calcium_of(start, reference), unknown, history)
 
 
 def _check(geometry: ConeBeamGeometry, spectra: Mapping[str, Spectrum]) -> None:
@@ -117,16 +115,6 @@ def _check(geometry: ConeBeamGeometry, spectra: Mapping[str, Spectrum]) -> None:
     used = [spectra[name] for name in sorted(set(geometry.sources))]
     if max(s.mean_energy for s in used) - min(s.mean_energy for s in used) < 1.0:
         raise ValueError("two materials need two spectra: all views have the same one, to 1 keV of its mean")
-
-
-def _calcium(energies: Sequence[float]) -> Tensor:
-    """Attenuation of CALCIUM_UNIT, 1/mm."""
-    dissolved = calcium_in_water(CALCIUM_UNIT).attenuation(energies)
-    return dissolved - material("water").attenuation(energies)
-
-
-def _per_calcium(reference_kev: float) -> float:
-    return float(_calcium((reference_kev,))[0])
 
 
 def _source(
@@ -144,7 +132,9 @@ def _source(
     blocks = [share for _, share in component_shares(components, geometry.select(views), beam, backend=backend)]
     shares = torch.cat([block.to(like) for block in blocks], dim=1) if components else blocks[0].to(like)
     energies = beam.beam.energies_kev.tolist()
-    basis = torch.stack([material("water").attenuation(energies), _calcium(energies)]).to(like)
+    basis = torch.stack([material("water").attenuation(energies), CALCIUM_UNIT * calcium_attenuation(energies)]).to(
+        like
+    )
     return SpectralViews(views, beam, shares, basis)
 
 
@@ -162,7 +152,7 @@ def _one_attenuation(
     for number in range(2):
         corrected, counted, mineral = torch.empty_like(lines), torch.empty_like(lines), None
         if number:
-            mineral = _projected(system, mineral_part(volume, sources[0].beam, mask=unknown))
+            mineral = projected(system, mineral_part(volume, sources[0].beam, mask=unknown))
         for source in sources:
             own = source.views
             part: Tensor | None = None if mineral is None else mineral[own]
@@ -175,10 +165,6 @@ def _one_attenuation(
 def _split(volume: Tensor, beam: BeamModel, unknown: Tensor | None) -> tuple[Tensor, Tensor]:
     """Water, and calcium in its unit, of one attenuation a voxel: above water all is calcium."""
     excess = mineral_part(volume, beam, mask=None)
-    return (volume - excess) / beam.water, excess / _per_calcium(float(beam.reference_kev or 0))
-
-
-def _projected(system: VoxelSystem, volume: Tensor) -> Tensor:
-    views = range(system.num_views)
-    blocks = [views[start : start + BLOCK_VIEWS] for start in range(0, len(views), BLOCK_VIEWS)]
-    return torch.cat([system.project(volume, block) for block in blocks])
+    return (volume - excess) / beam.water, excess / (
+        CALCIUM_UNIT * float(calcium_attenuation((float(beam.reference_kev or 0),))[0])
+    )

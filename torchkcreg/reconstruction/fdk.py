@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -94,13 +93,18 @@ def fdk(
     if len(groups) == 1:
         return _single_spot(read, geometry, grid, config, shard, backend)
     parts = [geometry.select(views) for views in groups]
-    shares, volumes = height_shares(parts, grid), []
-    for views, part, share in zip(groups, parts, shares, strict=True):
+    shares = height_shares(parts, grid)
+
+    def of_spot(number: int) -> Tensor:
+        views, part = groups[number], parts[number]
         own = shard.within(views) if shard is not None else None
-        of_spot = lambda block, views=views: read([views[i] for i in block])  # noqa: E731
-        volume = _single_spot(of_spot, part, grid, config, own, backend)
-        volumes.append(volume.mul_(share.to(volume)))
-    return torch.stack(volumes).sum(0)
+        volume = _single_spot(lambda block: read([views[i] for i in block]), part, grid, config, own, backend)
+        return volume.mul_(shares[number].to(volume))
+
+    total = of_spot(0)
+    for number in range(1, len(groups)):
+        total += of_spot(number)
+    return total
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from .fdk import fdk
 from .inpainting import inpainted
 from .known_component import without_components
 from .spectral import BeamModel
-from .system import VoxelSystem
+from .system import VoxelSystem, projected
 
 FEWEST_PIXELS = 200
 MOST_PIXELS = 20000
@@ -59,10 +59,7 @@ def metal_shadow(
     around = inpainted(without_components(lines, everything, beam)[0], metal, mask=mask)
     volume = fdk(around, geometry, grid, backend=backend).clamp_min(0)
     system = VoxelSystem(geometry, grid, backend=backend)
-    seen, displaced = (
-        torch.cat([system.project(part, range(v, v + 1)) for v in range(geometry.num_views)])
-        for part in (volume, volume * (1 - unknown))
-    )
+    seen, displaced = projected(system, volume), projected(system, volume * (1 - unknown))
     # what the volume lacks is as around the shadow, and where there is metal there is nothing else
     background = seen + inpainted(around - seen, metal, mask=mask) - displaced
     total = metal.sum(0)

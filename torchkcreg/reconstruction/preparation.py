@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.physics import Veil, veil_image
+from torchkcreg.physics import Veil
 from torchkcreg.scene import KnownComponent
 
-from .corrections import floored_line_integrals
+from .corrections import floored_line_integrals, scatter_image
 from .dead_pixels import filled_transmission
 from .known_component import component_shares, without_components
 from .spectral import BeamModel
@@ -80,9 +79,7 @@ def prepare(
         transmission = filled_transmission(transmission, mask)
     if tuple(transmission.shape) != expected or not bool(transmission.isfinite().all()):
         raise ValueError(f"transmission must be finite numbers of shape {expected}, got {tuple(transmission.shape)}")
-    if isinstance(scatter, Veil):
-        scatter = veil_image(transmission, scatter, geometry.pixel_spacing)
-    veil = torch.zeros_like(transmission) if scatter is None else scatter
+    veil = scatter_image(transmission, scatter, geometry.pixel_spacing)
     primary = transmission - veil
     measured = floored_line_integrals(primary, floor=floor)
     blocks = (

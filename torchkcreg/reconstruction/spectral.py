@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
-from torchkcreg.physics import Beam, Material, Spectrum, calcium_in_water, gaussian_blur, material
+from torchkcreg.physics import Beam, Material, Spectrum, calcium_attenuation, gaussian_blur, material
 
 NEWTON_STEPS = 8
 LEAST_LINE_INTEGRAL = -0.5
@@ -85,12 +85,11 @@ class BeamModel:
         base = material("water") if background is None else background
         energy = float(beam.weights @ beam.energies_kev) if reference_kev is None else float(reference_kev)
         energies = beam.energies_kev.tolist()
-        water, dissolved = material("water"), calcium_in_water(200)
-        calcium = dissolved.attenuation(energies) - water.attenuation(energies)
+        water = material("water")
         return cls(
             beam,
             base.attenuation(energies) / base.attenuation((energy,)),
-            calcium / (dissolved.attenuation((energy,)) - water.attenuation((energy,))),
+            calcium_attenuation(energies) / calcium_attenuation((energy,)),
             energy,
             float(water.attenuation((energy,))[0]),
         )

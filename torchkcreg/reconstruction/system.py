@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+import torch
 from torch import Tensor, nn
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.projector import backproject, project_volume
+
+BLOCK_VIEWS = 20  # projected together
 
 
 class System(Protocol):
@@ -37,6 +40,13 @@ class System(Protocol):
 
     def backproject(self, images: Tensor, views: Sequence[int]) -> Tensor:
         """The adjoint: a volume (D, H, W) from images (len(views), rows, cols)."""
+
+
+def projected(system: System, volume: Tensor) -> Tensor:
+    """Line integrals (V, rows, cols) of a volume in all views, some at a time."""
+    views = range(system.num_views)
+    blocks = [views[start : start + BLOCK_VIEWS] for start in range(0, len(views), BLOCK_VIEWS)]
+    return torch.cat([system.project(volume, block) for block in blocks])
 
 
 class VoxelSystem(nn.Module):

@@ -12,9 +12,7 @@ from .pwls_config import PWLSConfig
 from .roughness import roughness_curvature, roughness_gradient
 from .spectral import BeamModel
 from .subsets import ordered_subsets
-from .system import System
-
-BLOCK_VIEWS = 20
+from .system import BLOCK_VIEWS, System
 
 
 @dataclass(frozen=True)

@@ -11,19 +11,17 @@ from torch import Tensor
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
-from torchkcreg.physics import Beam, Veil, veil_image
+from torchkcreg.physics import Beam, Veil
 from torchkcreg.scene import KnownComponent
 
-from .corrections import refined_scatter
+from .corrections import refined_scatter, scatter_image
 from .known_component import component_shares, unknown_share
 from .preparation import PreparedData, prepare
 from .pwls import PWLS
 from .pwls_config import PWLSConfig
 from .sharding import ViewShard
 from .spectral import BeamModel, mineral_part, transmitted_behind
-from .system import VoxelSystem
-
-BLOCK_VIEWS = 20
+from .system import VoxelSystem, projected
 
 
 @dataclass(frozen=True)
@@ -92,10 +90,7 @@ def reconstruct(
     beam = BeamModel.behind(beam) if isinstance(beam, Beam) else beam
     system = VoxelSystem(geometry, grid, backend=backend)
     unknown = unknown_share(components, grid).to(transmission) if components else None
-    if isinstance(scatter, Veil):
-        scatter = veil_image(transmission, scatter, geometry.pixel_spacing)
-    scatter = torch.zeros_like(transmission) if scatter is None else scatter
-    first = scatter
+    first = scatter = scatter_image(transmission, scatter, geometry.pixel_spacing)
     shares = list(
         component_shares(components, geometry, beam, blur_sigma_px=blur_sigma_px, backend=backend)
     )  # the same in all passes
@@ -105,10 +100,10 @@ def reconstruct(
     for index in range(start, passes):
         mineral = None
         if index > 0 and volume is not None:
-            mineral = _projected(system, mineral_part(volume, beam, mask=unknown))
+            mineral = projected(system, mineral_part(volume, beam, mask=unknown))
             if components:
                 visible = volume if unknown is None else volume * unknown
-                seen = _projected(system, visible)
+                seen = projected(system, visible)
                 scatter = _refined(transmission, first, seen, mineral, shares, beam, geometry.pixel_spacing)
         data = prepare(
             transmission,
@@ -136,12 +131,6 @@ def reconstruct(
     if done is None:
         raise ValueError(f"the state is of pass {start}, but there are only {passes}")
     return done
-
-
-def _projected(system: VoxelSystem, volume: Tensor) -> Tensor:
-    views = range(system.num_views)
-    blocks = [views[start : start + BLOCK_VIEWS] for start in range(0, len(views), BLOCK_VIEWS)]
-    return torch.cat([system.project(volume, block) for block in blocks])
 
 
 def _refined(

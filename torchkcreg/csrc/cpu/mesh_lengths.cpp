@@ -223,16 +223,19 @@ Tensor mesh_lengths_backward(const Tensor& gradient_, const Tensor& corners_, co
   Tensor result = torch::stable::new_zeros(corners, {p.images, p.vertices, 3});
   double* sums = result.mutable_data_ptr<double>();
   const int64_t size = p.vertices * 3;
-  std::vector<double> bands(p.images * p.bands() * size);
-  torch::stable::parallel_for(0, p.images * p.bands(), 1, [&](int64_t begin, int64_t end) {
-    for (int64_t t = begin; t < end; ++t) {
-      const int64_t image = t / p.bands(), row = t % p.bands() * kRowsOfTask;
-      add_band_gradient(p, image, row, std::min(row + kRowsOfTask, p.rows),
-                        gradient.const_data_ptr<double>() + image * p.rows * p.cols, bands.data() + t * size);
+  std::vector<double> bands(p.bands() * size);  // of one image at a time: many views would take gigabytes
+  for (int64_t image = 0; image < p.images; ++image) {
+    std::fill(bands.begin(), bands.end(), 0.0);
+    torch::stable::parallel_for(0, p.bands(), 1, [&](int64_t begin, int64_t end) {
+      for (int64_t t = begin; t < end; ++t) {
+        const int64_t row = t * kRowsOfTask;
+        add_band_gradient(p, image, row, std::min(row + kRowsOfTask, p.rows),
+                          gradient.const_data_ptr<double>() + image * p.rows * p.cols, bands.data() + t * size);
+      }
+    });
+    for (int64_t t = 0; t < p.bands(); ++t) {
+      for (int64_t i = 0; i < size; ++i) sums[image * size + i] += bands[t * size + i];
     }
-  });
-  for (int64_t t = 0; t < p.images * p.bands(); ++t) {
-    for (int64_t i = 0; i < size; ++i) sums[t / p.bands() * size + i] += bands[t * size + i];
   }
   return result;
 }
