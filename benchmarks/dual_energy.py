@@ -52,11 +52,7 @@ def scan(bath: str) -> tuple[ConeBeamGeometry, torch.Tensor]:
     parts = [Part("bath", rod(0.0, 0.0, 34.0), bath), Part("plate", plate(), "titanium", inside="bath")]
     parts += [Part(name, rod(*place, 6.0), name, inside="bath") for name, place in RODS.items()]
     detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16)
-    images = torch.zeros(VIEWS, *geometry.det_shape)
-    for name, spectrum in SPECTRA.items():
-        own = [view for view in range(VIEWS) if sources[view] == name]
-        images[own] = simulate_projections(geometry.select(own), parts, spectrum, detector=detector).float()
-    return geometry, images / detector.open_beam
+    return geometry, simulate_projections(geometry, parts, SPECTRA, detector=detector).float() / detector.open_beam
 
 
 def rows(bath: str, found: Decomposition, far: torch.Tensor) -> list[str]:

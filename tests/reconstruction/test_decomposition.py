@@ -40,11 +40,7 @@ def scan() -> tuple[ConeBeamGeometry, torch.Tensor]:
     parts = [Part("bath", rod(0.0, 0.0, 34.0), "water"), Part("plate", plate(), "titanium", inside="bath")]
     parts += [Part(name, rod(*place, 6.0), name, inside="bath") for name, place in RODS.items()]
     detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16)
-    images = torch.zeros(VIEWS, *geometry.det_shape)
-    for name, spectrum in SPECTRA.items():
-        own = [view for view in range(VIEWS) if sources[view] == name]
-        images[own] = simulate_projections(geometry.select(own), parts, spectrum, detector=detector).float()
-    return geometry, images / detector.open_beam
+    return geometry, simulate_projections(geometry, parts, SPECTRA, detector=detector).float() / detector.open_beam
 
 
 def test_rods_are_recovered_beside_a_plate(scan):
@@ -66,10 +62,7 @@ def test_tissue_lighter_than_water_is_no_lack_of_calcium(scan):
     geometry, _ = scan
     bath = Part("bath", rod(0.0, 0.0, 30.0), "adipose_tissue")
     detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16).without_noise()
-    images = torch.zeros(VIEWS, *geometry.det_shape)
-    for name, spectrum in SPECTRA.items():
-        own = [view for view in range(VIEWS) if geometry.sources[view] == name]
-        images[own] = simulate_projections(geometry.select(own), [bath], spectrum, detector=detector).float()
+    images = simulate_projections(geometry, [bath], SPECTRA, detector=detector).float()
     found = decompose(images / detector.open_beam, geometry, GRID, SPECTRA, config=PWLSConfig(iterations=20, subsets=5))
     inside = cylinder_region(GRID, (0, 0, -9), (0, 0, 9), 20.0)
     both = region_statistics(found.calcium_mg_ml, inside).mean

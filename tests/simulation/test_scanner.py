@@ -9,8 +9,8 @@ import pytest
 import torch
 import trimesh
 
-from torchkcreg.geometry import circular_geometry
-from torchkcreg.physics import Spectrum, material
+from torchkcreg.geometry import ConeBeamGeometry, circular_geometry
+from torchkcreg.physics import Spectrum, material, tungsten_spectrum
 from torchkcreg.simulation import Cylinder, DetectorModel, Part, Sphere, Tube, material_paths, simulate_projections
 
 GEOMETRY = circular_geometry([0.0], sad=400, sdd=600, det_shape=(64, 64), pixel_spacing=(0.5, 0.5))
@@ -126,3 +126,20 @@ def test_scatter_from_what_is_removed_vanishes_in_the_open_beam_and_glare_keeps_
     rod = Part("rod", Cylinder([0, 0, -9], [0, 0, 9], 3.0), "steel")
     sharp, scattered = (simulate_projections(GEOMETRY, [rod], MONO, detector=d)[0].float() for d in (IDEAL, scanner))
     assert float(scattered.min()) > float(sharp.min()) + 50
+
+
+def test_views_of_several_sources_are_taken_in_their_own_spectra():
+    circle = circular_geometry([0, 90], sad=404, sdd=538, det_shape=(6, 8), pixel_spacing=(4.0, 4.0))
+    geometry = ConeBeamGeometry(circle.projection_matrices, (6, 8), (4.0, 4.0), sources=["low", "high"])
+    parts = [Part("ball", Sphere(torch.zeros(3), 10.0), "water")]
+    spectra = {"low": tungsten_spectrum(70), "high": tungsten_spectrum(120)}
+    detector = DetectorModel().without_noise()
+    both = simulate_projections(geometry, parts, spectra, detector=detector)
+    for view, spectrum in enumerate(spectra.values()):
+        alone = simulate_projections(geometry.select([view]), parts, spectrum, detector=detector)
+        assert torch.equal(both[view], alone[0])
+    assert not torch.equal(both[0], both[1])
+    with pytest.raises(ValueError, match="got none for high"):
+        simulate_projections(geometry, parts, {"low": spectra["low"]})
+    with pytest.raises(ValueError, match="got none for no source"):
+        simulate_projections(circle, parts, spectra)

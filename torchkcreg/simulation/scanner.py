@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -83,7 +83,7 @@ class DetectorModel:
 def simulate_projections(
     geometry: ConeBeamGeometry,
     parts: Sequence[Part],
-    spectrum: Spectrum,
+    spectrum: Spectrum | Mapping[str, Spectrum],
     *,
     detector: DetectorModel | None = None,
     seed: int = 0,
@@ -98,18 +98,24 @@ def simulate_projections(
     Args:
         geometry: The views.
         parts: What stands in the beam, in the world's frame.
-        spectrum: The detected spectrum.
+        spectrum: The detected spectrum, or one for each of the geometry's sources.
         detector: The detector; the default one where None.
         seed: Seed of the noise.
 
     Raises:
-        ValueError: As `material_paths` does.
+        ValueError: As `material_paths` does, or where a view's source has no spectrum.
     """
     detector = detector or DetectorModel()
+    if isinstance(spectrum, Spectrum):
+        spectra = [spectrum] * geometry.num_views
+    elif missing := sorted(set(geometry.sources or ("no source",)) - set(spectrum)):
+        raise ValueError(f"spectrum must have one for each source, got none for {', '.join(missing)}")
+    else:
+        spectra = [spectrum[source] for source in geometry.sources or ()]
     generator = torch.Generator().manual_seed(seed)
     images = []
-    for matrix in geometry.projection_matrices:
-        primary = _primary(matrix.cpu(), geometry.det_shape, parts, spectrum, detector.supersample)
+    for matrix, own in zip(geometry.projection_matrices, spectra, strict=True):
+        primary = _primary(matrix.cpu(), geometry.det_shape, parts, own, detector.supersample)
         signal = _detected(primary, geometry.pixel_spacing, detector)
         images.append(_counts(signal, detector, generator))
     return torch.stack(images)
