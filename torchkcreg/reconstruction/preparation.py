@@ -68,6 +68,7 @@ def prepare(
         oversampling: sub-pixels along each side of a pixel for the components' projections.
         backend: of the projection.
 
+    >>> import torch
     >>> from torchkcreg.geometry import circular_geometry
     >>> geometry = circular_geometry([0, 90], sad=404, sdd=538, det_shape=(4, 4), pixel_spacing=(2.0, 2.0))
     >>> data = prepare(torch.full((2, 4, 4), 0.5), geometry, BeamModel.monoenergetic([]))
