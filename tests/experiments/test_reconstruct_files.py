@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torchkcreg.experiments import (
     registered_components,
 )
 from torchkcreg.experiments.reconstruct_files import resolve_options
+from torchkcreg.experiments.reconstruction_inputs import read_reconstruction_inputs
 from torchkcreg.geometry import circular_geometry
 from torchkcreg.io import RunFolder, read_volume, write_geometry, write_projections
 from torchkcreg.physics import Beam, material, tungsten_spectrum
@@ -123,9 +125,9 @@ def test_a_beam_that_nobody_knows_is_estimated_behind_the_registered_metal(ball_
     assert beam["alloys"] == ["steel"] and 0.9 < beam["scales"][0] < 1.1
     assert (tmp_path / "out" / "beam.png").stat().st_size > 1000
     assert main(arguments(ball_scan, tmp_path / "other", "--beam", "estimate")) == 2
-    assert "behind known metal, which kcrec and kcmar have, not fdk" in capsys.readouterr().err
+    assert "beam estimate comes from known metal, which kcrec and kcmar have, not fdk" in capsys.readouterr().err
     assert main([*options, *estimated, "--method", "kcrec", "--monoenergetic", "--overwrite"]) == 2
-    assert "a beam of one energy cannot be estimated" in capsys.readouterr().err
+    assert "a beam of one energy is never that of beam estimate" in capsys.readouterr().err
 
 
 def test_the_registered_metal_has_the_volume_of_its_meshes(small_run, small_case):
@@ -180,6 +182,38 @@ def test_a_stopped_reconstruction_resumes_to_the_same_volume(ball_scan, tmp_path
     with pytest.raises(ValueError, match="started with other reconstruction"):
         changed = options.model_copy(update={"beta": 3.0})
         reconstruct_files(files, tmp_path / "cut", changed, resume=True, figures=False)
+
+
+def test_voxels_near_the_metal_are_divided(ball_scan, small_run, tmp_path, capsys):
+    flags = ("--method", "kcrec", "--run", small_run, "--iterations", 8, "--subsets", 2, "--scatter", "none")
+    assert main(arguments(ball_scan, tmp_path / "out", *flags, "--refine", 2, "--refine-within", 4)) == 0
+    volume, grid = read_volume(tmp_path / "out" / "volume.mha")
+    near, fine = read_volume(tmp_path / "out" / "near_metal_volume.mha")
+    assert fine.spacing == tuple(step / 2 for step in grid.spacing)
+    whole, _ = read_volume(tmp_path / "out" / "near_metal_with_implant.mha")
+    assert whole.max() > 3 * near.max()
+    metal = sum(component.fraction(fine) for component in registered_components(small_run))
+    assert float(metal.sum()) * fine.voxel_volume > 100.0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["near_metal_mm"] == list(fine.spacing) and metrics["shape"] == list(volume.shape)
+    assert main(arguments(ball_scan, tmp_path / "other", "--method", "pwls", "--refine", 2)) == 2
+    assert "divided near known metal, which kcrec has, not pwls" in capsys.readouterr().err
+
+
+def test_beam_and_blur_may_be_what_the_registration_found(small_run, tmp_path):
+    """Hardness and blur as the run's folder has them; the reference energy stays the spectrum's."""
+    harder = tmp_path / "run"
+    shutil.copytree(small_run, harder)
+    record = json.loads((harder / "deformation.json").read_text())
+    record["intensity"]["hardness"], record["blur_mm"] = 6.0, 0.3
+    (harder / "deformation.json").write_text(json.dumps(record))
+    files = ReconstructionFiles(run=harder)
+    options = ReconstructionOptions(method="kcrec", scatter="none", size_mm=(10, 10, 10), spacing_mm=5)
+    given, found = (read_reconstruction_inputs(files, options.model_copy(update={"beam": b})) for b in ("given", "run"))
+    assert found.beam.reference_kev == given.beam.reference_kev
+    energies = [float(inputs.beam.beam.weights @ inputs.beam.beam.energies_kev) for inputs in (given, found)]
+    assert energies[1] > energies[0] + 2
+    assert given.blur_sigma_px == pytest.approx(0.3 / given.geometry.pixel_spacing[0])
 
 
 def test_wrong_input_is_one_line_that_names_it(ball_scan, small_run, tmp_path, capsys):

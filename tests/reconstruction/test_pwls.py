@@ -7,7 +7,7 @@ import torch
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import MultisourceScanner, VolumeGrid, circular_geometry
 from torchkcreg.reconstruction import PWLS, PWLSConfig, VoxelSystem, pwls, statistical_weights
-from torchkcreg.reconstruction.roughness import roughness_gradient
+from torchkcreg.reconstruction.roughness import VoxelRoughness
 
 GRID = VolumeGrid.centered((6, 12, 12), 5.0)
 
@@ -43,7 +43,7 @@ def test_the_minimum_has_no_gradient_where_the_volume_is_positive(problem):
     volume = solver.run().volume
     views = range(40)
     slope = system.backproject(weights * (system.project(volume, views) - data), views)
-    slope += 2.0 * roughness_gradient(volume, spacing=GRID.spacing)
+    slope += 2.0 * VoxelRoughness(GRID.spacing).gradient(volume)
     start = system.backproject(weights * data, views).abs().max()
     assert slope[volume > 0].abs().max() < 1e-3 * start
     assert slope[volume == 0].min() > -1e-3 * start

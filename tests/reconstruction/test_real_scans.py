@@ -54,7 +54,7 @@ def test_pwls_of_a_limited_angle_scan_shows_the_disc_and_its_holes():
     )
     system = VoxelSystem(geometry, VolumeGrid.centered((1, 160, 160), 0.53))
     config = PWLSConfig(iterations=25, subsets=10, beta=1.0)
-    volume = pwls(system, data, statistical_weights(torch.exp(-data)), config, spacing=(0.53, 0.53, 0.53)).volume
+    volume = pwls(system, data, statistical_weights(torch.exp(-data)), config).volume
     points = system.grid.points()
     radius = points[0, ..., :2].norm(dim=-1)
     acrylic = volume[0][radius < 25]

@@ -144,6 +144,9 @@ def _add_reconstruct(commands) -> None:
     command.add_argument(
         "--center", type=float, nargs=3, dest="center_mm", metavar=("X", "Y", "Z"), help="its middle, mm"
     )
+    fine = "divide voxels near known metal into so many along each edge (kcrec)"
+    command.add_argument("--refine", type=int, metavar="N", help=fine)
+    command.add_argument("--refine-within", type=float, dest="refine_within_mm", metavar="MM", help="default: 5")
     command.add_argument("--preset", help="momentum (50 iterations) or paper (500 of 20 subsets)")
     command.add_argument("--iterations", type=int, help="passes through all views")
     command.add_argument("--subsets", type=int, help="ordered subsets")
@@ -156,8 +159,8 @@ def _add_reconstruct(commands) -> None:
     command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")
     streamed = "read some views at a time, of scans larger than memory (fdk and kcmar; NPY, uncompressed MHA)"
     command.add_argument("--stream", action="store_true", default=None, help=streamed)
-    estimated = "given (default), or estimate: out of the metal's shadow, where spectrum or alloy are not known"
-    command.add_argument("--beam", choices=("given", "estimate"), help=estimated)
+    estimated = "given (default), run (as hard as found), or estimate: where spectrum or alloy are not known"
+    command.add_argument("--beam", choices=("given", "run", "estimate"), help=estimated)
     command.add_argument("--material", help="of the implant, where the registration had none")
     alone = "the object is of this material alone, such as an implant on a bench: fdk gives its share in each voxel"
     command.add_argument("--single-material", metavar="NAME", help=alone)

@@ -1,6 +1,7 @@
 """How good a registration is, and what it measured: errors at reference points and of the shape, displacement maps."""
 
 from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
+from .bead_shadows import bead_shadows, track_beads
 from .beads import Beads, find_beads
 from .densitometry import MineralContent, mineral_content
 from .displacement import DisplacementMap, displacement_map
@@ -25,6 +26,7 @@ __all__ = [
     "ShapeEvaluation",
     "align_to_surface",
     "bb_rmse",
+    "bead_shadows",
     "cylinder_region",
     "displacement_map",
     "distance_statistics",
@@ -44,4 +46,5 @@ __all__ = [
     "relative_motion",
     "rigid_coherent_point_drift",
     "surface_distances",
+    "track_beads",
 ]

@@ -8,9 +8,11 @@ from typing import Any
 
 import torch
 import torch.distributed as distributed
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchkcreg.callbacks import Callback
+from torchkcreg.geometry import TwoLevelGrid, VolumeGrid
 from torchkcreg.io import RunFolder, read_config, read_volume, write_volume
 from torchkcreg.physics import material
 from torchkcreg.reconstruction import (
@@ -23,6 +25,7 @@ from torchkcreg.reconstruction import (
     hounsfield,
     known_materials,
     reconstruct,
+    unknown_share,
     with_components,
 )
 from torchkcreg.visualization import beam_figure, reconstruction_figure
@@ -33,7 +36,11 @@ from .reconstruction_inputs import ReconstructionInputs, read_reconstruction_inp
 from .reconstruction_options import ReconstructionFiles, ReconstructionOptions
 
 CHECKPOINT_EVERY = 5
-OUTPUTS = ("volume.mha", "volume_hu.mha", "with_implant.mha", "slices.png", "beam.png")
+OUTPUTS = (
+    *(f"{level}{kind}.mha" for level in ("", "near_metal_") for kind in ("volume", "volume_hu", "with_implant")),
+    "slices.png",
+    "beam.png",
+)
 
 
 def resolve_options(overrides: dict[str, Any], config: Path | None = None) -> ReconstructionOptions:
@@ -59,7 +66,8 @@ def reconstruct_files(
 
     The folder holds ``volume.mha`` in 1/mm (behind known components the background alone; of a single material the
     share of it, and no CT numbers), ``volume_hu.mha``,
-    ``with_implant.mha`` (with known components), ``metrics.json``, ``config.yaml``, ``slices.png``
+    ``with_implant.mha`` (with known components), the same three as ``near_metal_...`` where voxels near the metal are
+    divided, ``metrics.json``, ``config.yaml``, ``slices.png``
     and, of an estimated beam, ``beam.png``. Under
     ``torchrun`` the views are shared out over the processes and the first one writes.
 
@@ -83,10 +91,10 @@ def reconstruct_files(
         record = _record(files, options)
         run = _folder(out, record, overwrite=overwrite, resume=resume) if rank == 0 else None
         state = RunFolder(out).load_checkpoint() if resume else None
-        volume, history = _reconstructed(files, inputs, options, shard, run, state)
-        metrics = _metrics(inputs, options, volume, history, time.perf_counter() - start)
+        levels, history = _reconstructed(files, inputs, options, shard, run, state)
+        metrics = _metrics(inputs, options, levels, history, time.perf_counter() - start)
         if run is not None:
-            _write(run, inputs, options, volume, metrics, figures)
+            _write(run, inputs, options, levels, metrics, figures)
     return metrics
 
 
@@ -97,12 +105,13 @@ def _reconstructed(
     shard: ViewShard | None,
     run: RunFolder | None,
     state: dict[str, Any] | None,
-) -> tuple[Tensor, list[dict[str, Any]]]:
+) -> tuple[list[tuple[Tensor, VolumeGrid]], list[dict[str, Any]]]:
+    """The volume and its grid, and where voxels are divided those near the metal as well; records of the iterations."""
     geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
     if options.is_filtered:
         ramp = FDKConfig(window=options.window)
         lines = line_integrals(inputs, options) if inputs.file is None else streamed(inputs, options)
-        return fdk(lines, geometry, grid, config=ramp, shard=shard, backend=backend), []
+        return [(fdk(lines, geometry, grid, config=ramp, shard=shard, backend=backend), grid)], []
     changes = {name: getattr(options, name) for name in ("iterations", "subsets") if getattr(options, name) is not None}
     config = PWLSConfig.preset(options.preset, beta=options.beta, **changes)
     initial = None
@@ -112,10 +121,14 @@ def _reconstructed(
             raise ValueError(f"initial volume {files.initial} has shape {its_grid.shape}, the grid has {grid.shape}")
         if not its_grid.lies_on(grid):
             raise ValueError(f"initial volume {files.initial} has the grid's shape, but lies elsewhere in the world")
+    levels = None
+    if options.refine > 1:
+        metal = 1 - unknown_share(inputs.components, grid)
+        levels = TwoLevelGrid.near(metal, grid, within_mm=options.refine_within_mm, factor=options.refine)
     result = reconstruct(
         inputs.transmission,
         geometry,
-        grid,
+        levels or grid,
         inputs.beam,
         config=config,
         components=inputs.components,
@@ -123,13 +136,16 @@ def _reconstructed(
         mask=inputs.mask,
         passes=options.num_passes,
         initial=initial,
+        blur_sigma_px=inputs.blur_sigma_px,
         shard=shard,
         backend=backend,
         callbacks=[] if run is None else [_Checkpoints(run, config.iterations)],
         state=state,
         progress=None if run is not None else False,
     )
-    return result.volume, result.history
+    if levels is None:
+        return [(result.volume, grid)], result.history
+    return list(zip(levels.volumes(result.volume), (grid, levels.fine), strict=True)), result.history
 
 
 class _Checkpoints(Callback):
@@ -146,14 +162,15 @@ class _Checkpoints(Callback):
 def _metrics(
     inputs: ReconstructionInputs,
     options: ReconstructionOptions,
-    volume: Tensor,
+    levels: list[tuple[Tensor, VolumeGrid]],
     history: list[dict[str, Any]],
     seconds: float,
 ) -> dict[str, Any]:
-    beam = inputs.beam
+    beam, volume = inputs.beam, levels[0][0]
     return {
         "shape": list(volume.shape),
         "spacing_mm": list(inputs.grid.spacing),
+        "near_metal_mm": list(levels[1][1].spacing) if len(levels) > 1 else None,
         "mean": float(volume.mean()),
         "largest": float(volume.max()),
         "reference_kev": beam.reference_kev,
@@ -179,38 +196,45 @@ def _write(
     run: RunFolder,
     inputs: ReconstructionInputs,
     options: ReconstructionOptions,
-    volume: Tensor,
+    levels: list[tuple[Tensor, VolumeGrid]],
     metrics: dict[str, Any],
     figures: bool,
 ) -> None:
-    grid, beam = inputs.grid, inputs.beam
-    shown = {"reconstruction": volume}
-    write_volume(run.path / "volume.mha", volume, grid)
-    shares = options.single_material is not None
-    if not shares:
-        write_volume(run.path / "volume_hu.mha", hounsfield(volume, beam.water).round().to(torch.int32), grid)
-    metal = None
-    if inputs.components:
-        energy = beam.reference_kev
-        if energy is None:
-            values = [float(row[0]) for row in beam.attenuation]
-        else:
-            values = [float(material(m).attenuation((energy,))[0]) for m in known_materials(inputs.components)]
-        whole = with_components(volume, inputs.components, grid, values)
-        write_volume(run.path / "with_implant.mha", whole, grid)
-        shown = {"background": volume, "with the implant": whole}
-        metal = sum((component.fraction(grid) for component in inputs.components), torch.zeros(grid.shape))
+    beam, shares = inputs.beam, options.single_material is not None
+    for prefix, (volume, grid) in zip(("", "near_metal_"), levels, strict=False):
+        write_volume(run.path / f"{prefix}volume.mha", volume, grid)
+        if not shares:
+            numbers = hounsfield(volume, beam.water).round().to(torch.int32)
+            write_volume(run.path / f"{prefix}volume_hu.mha", numbers, grid)
+        if inputs.components:
+            whole = _with_implant(inputs, volume, grid)
+            write_volume(run.path / f"{prefix}with_implant.mha", whole, grid)
     if figures:
-        middle, reach = grid.origin[2] + grid.size_mm[2] / 2, grid.size_mm[2] / 4
-        heights = (middle - reach, middle, middle + reach) if grid.shape[0] > 3 else (middle,)
-        window = (0.0, 1.2 if shares else 2 * beam.water)
         if (found := inputs.estimate) is not None:
             curve = beam_figure(found.beam.beam, found.alloys, found.lengths_mm, found.measured)
             run.write_figure("beam.png", curve)
-        run.write_figure(
-            "slices.png", reconstruction_figure(shown, grid, heights_mm=heights, window=window, metal=metal)
-        )
+        window = (0.0, 1.2 if shares else 2 * beam.water)
+        run.write_figure("slices.png", _slices(inputs, *levels[-1], window))
     run.write_metrics(metrics)
+
+
+def _with_implant(inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid) -> Tensor:
+    energy = inputs.beam.reference_kev
+    if energy is None:
+        values = [float(row[0]) for row in inputs.beam.attenuation]
+    else:
+        values = [float(material(m).attenuation((energy,))[0]) for m in known_materials(inputs.components)]
+    return with_components(volume, inputs.components, grid, values)
+
+
+def _slices(inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid, window: tuple[float, float]) -> Figure:
+    middle, reach = grid.origin[2] + grid.size_mm[2] / 2, grid.size_mm[2] / 4
+    heights = (middle - reach, middle, middle + reach) if grid.shape[0] > 3 else (middle,)
+    shown, metal = {"reconstruction": volume}, None
+    if inputs.components:
+        shown = {"background": volume, "with the implant": _with_implant(inputs, volume, grid)}
+        metal = sum((component.fraction(grid) for component in inputs.components), torch.zeros(grid.shape))
+    return reconstruction_figure(shown, grid, heights_mm=heights, window=window, metal=metal)
 
 
 def _record(files: ReconstructionFiles, options: ReconstructionOptions) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.io import ProjectionFile, read_config, read_geometry, read_projections, read_run, read_spectrum
-from torchkcreg.physics import Spectrum, material, tungsten_spectrum
+from torchkcreg.physics import Beam, Spectrum, material, tungsten_spectrum
 from torchkcreg.reconstruction import (
     BeamEstimate,
     BeamModel,
@@ -23,6 +24,7 @@ from torchkcreg.reconstruction import (
     fit_veil,
     known_materials,
 )
+from torchkcreg.registration import RegistrationResult
 
 from .reconstruction_options import ReconstructionFiles, ReconstructionOptions
 from .registered_components import registered_components
@@ -46,6 +48,7 @@ class ReconstructionInputs:
         estimate: What was estimated of the beam, where that was asked for.
         file: Where the views are that are not in `transmission`, which then are a sample of them; None if all are.
         components: The metal in its place; none but for "kcrec" and "kcmar".
+        blur_sigma_px: The system's blur as the registration found it, in pixels.
     """
 
     geometry: ConeBeamGeometry
@@ -58,6 +61,7 @@ class ReconstructionInputs:
     components: list[KnownComponent]
     estimate: BeamEstimate | None = None
     file: ProjectionFile | None = None
+    blur_sigma_px: float = 0.0
 
     def of_views(self, views: list[int]) -> ReconstructionInputs:
         """The same of some views, read from the file."""
@@ -94,10 +98,14 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         named = options.material or result.implants[0].material
         likely = ALLOYS[0] if options.beam == "estimate" and named is None else options.material
         components = registered_components(files.run, components=files.components, material=likely, result=result)
-    elif options.beam == "estimate":
-        raise ValueError(f"a beam is estimated behind known metal, which kcrec and kcmar have, not {options.method}")
-    if options.beam == "estimate" and options.monoenergetic:
-        raise ValueError("a beam of one energy cannot be estimated: leave out monoenergetic, or the estimate")
+    elif options.beam != "given":
+        raise ValueError(
+            f"beam {options.beam} comes from known metal, which kcrec and kcmar have, not {options.method}"
+        )
+    if options.refine > 1 and options.method != "kcrec":
+        raise ValueError(f"voxels are divided near known metal, which kcrec has, not {options.method}")
+    if options.beam != "given" and options.monoenergetic:
+        raise ValueError(f"a beam of one energy is never that of beam {options.beam}: leave one of the two out")
     spectrum = read_spectrum(files.spectrum) if files.spectrum is not None else None
     if options.single_material is not None:
         material(options.single_material)
@@ -139,12 +147,13 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         transmission,
         projections.mask,
         grid,
-        _beam(spectrum, options, components) if estimate is None else estimate.beam,
+        _beam(spectrum, options, components, result) if estimate is None else estimate.beam,
         scatter,
         spectrum or tungsten_spectrum(),
         components,
         estimate,
         file,
+        0.0 if result is None else result.blur_mm / math.sqrt(math.prod(geometry.pixel_spacing)),
     )
 
 
@@ -183,13 +192,22 @@ def _grid(geometry: ConeBeamGeometry, options: ReconstructionOptions) -> VolumeG
     return VolumeGrid.centered(shape, options.spacing_mm, center=options.center_mm)
 
 
-def _beam(spectrum: Spectrum | None, options: ReconstructionOptions, components: list[KnownComponent]) -> BeamModel:
+def _beam(
+    spectrum: Spectrum | None,
+    options: ReconstructionOptions,
+    components: list[KnownComponent],
+    result: RegistrationResult | None,
+) -> BeamModel:
     metals = [material(name) for name in known_materials(components)]
     if options.monoenergetic or (spectrum is None and not components):
         energy = (spectrum or tungsten_spectrum()).mean_energy
         water = float(material("water").attenuation((energy,))[0])
         return BeamModel.monoenergetic([float(m.attenuation((energy,))[0]) for m in metals], water=water)
-    return BeamModel.polyenergetic(metals, spectrum or tungsten_spectrum())
+    likely = spectrum or tungsten_spectrum()
+    if options.beam == "run" and result is not None:
+        found = Beam.of(metals, likely).behind(result.intensity.get("hardness", 0.0), range(len(metals)))
+        return BeamModel.behind(found, reference_kev=likely.mean_energy)
+    return BeamModel.polyenergetic(metals, likely)
 
 
 def _scatter(

@@ -42,6 +42,8 @@ class ReconstructionOptions(Config):
         spacing_mm: Edge of a voxel.
         size_mm: Size (x, y, z) of the volume; the field of view if None.
         center_mm: Its middle (x, y, z), where a size is given.
+        refine: Voxels near known metal are divided into so many along each edge ("kcrec"); 1: none are.
+        refine_within_mm: How near.
         preset: "momentum" or "paper" (500 iterations of 20 subsets).
         iterations: Overrides the preset's.
         subsets: Overrides the preset's.
@@ -53,7 +55,8 @@ class ReconstructionOptions(Config):
             kinds; "none"; or its fraction of the primary.
         scatter_sigma_mm: How broad a given fraction's scatter is.
         monoenergetic: One energy, as in the paper, even where a spectrum is known.
-        beam: "given" is the spectrum of the file and the materials of the run, or a likely one; "estimate" is what the
+        beam: "given" is the spectrum of the file and the materials of the run, or a likely one; "run" is the same, as
+            hard as the registration found it; "estimate" is what the
             metal's shadow tells of a spectrum, or an implant's material, that nobody knows (methods with components).
         stream: Views are read some at a time, of scans that are larger than memory ("fdk" and "kcmar").
         material: The implant's, where the registration had none.
@@ -66,6 +69,8 @@ class ReconstructionOptions(Config):
     spacing_mm: float = Field(0.8, gt=0)
     size_mm: tuple[float, float, float] | None = None
     center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    refine: int = Field(1, ge=1, le=8)
+    refine_within_mm: float = Field(5.0, gt=0)
     preset: Literal["momentum", "paper"] = "momentum"
     iterations: int | None = Field(None, ge=1)
     subsets: int | None = Field(None, ge=1)
@@ -75,7 +80,7 @@ class ReconstructionOptions(Config):
     scatter: Literal["auto", "run", "none"] | float = "auto"
     scatter_sigma_mm: float = Field(40.0, gt=0)
     monoenergetic: bool = False
-    beam: Literal["given", "estimate"] = "given"
+    beam: Literal["given", "run", "estimate"] = "given"
     stream: bool = False
     material: str | None = None
     single_material: str | None = None

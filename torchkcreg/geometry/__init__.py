@@ -4,6 +4,7 @@ The world is right-handed in mm with z along the gantry's axis; a view is one 3 
 else about it (source, rays, pixel positions) is derived from that.
 """
 
+from torchkcreg.geometry.calibration import Calibration, calibrate
 from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
 from torchkcreg.geometry.multisource import MultisourceScanner
@@ -18,13 +19,17 @@ from torchkcreg.geometry.se3 import (
     transform_points,
     vector_from_rotation,
 )
+from torchkcreg.geometry.two_level_grid import TwoLevelGrid
 from torchkcreg.geometry.volume_grid import VolumeGrid
 
 __all__ = [
+    "Calibration",
     "ConeBeamGeometry",
     "MultisourceScanner",
+    "TwoLevelGrid",
     "VolumeGrid",
     "across",
+    "calibrate",
     "circular_geometry",
     "fit_rigid",
     "invert_rigid",

@@ -28,12 +28,13 @@ from .preparation import PreparedData, prepare
 from .pwls import PWLS, pwls
 from .pwls_config import PWLSConfig
 from .reconstructed import Reconstruction
-from .roughness import quadratic_roughness
+from .roughness import Roughness, VoxelRoughness, quadratic_roughness
 from .sharding import ViewShard
 from .single_material import path_lengths_through
 from .spectral import BeamModel, background_line_integrals, behind_metal, mineral_part
 from .subsets import ordered_subsets
 from .system import System, VoxelSystem
+from .two_levels import TwoLevelRoughness, TwoLevelSystem
 from .weights import statistical_weights
 from .workflow import IterativeResult, reconstruct
 
@@ -48,9 +49,13 @@ __all__ = [
     "PWLSConfig",
     "PreparedData",
     "Reconstruction",
+    "Roughness",
     "System",
+    "TwoLevelRoughness",
+    "TwoLevelSystem",
     "Veil",
     "ViewShard",
+    "VoxelRoughness",
     "VoxelSystem",
     "background_line_integrals",
     "behind_metal",

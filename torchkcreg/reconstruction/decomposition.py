@@ -18,6 +18,7 @@ from .dead_pixels import filled_transmission
 from .known_component import component_shares, known_materials, unknown_share, without_components
 from .pwls import pwls
 from .pwls_config import PWLSConfig
+from .roughness import VoxelRoughness
 from .spectral import BeamModel, mineral_part
 from .system import VoxelSystem, projected
 from .two_materials import SpectralViews, TwoMaterials
@@ -158,7 +159,9 @@ def _one_attenuation(
             part: Tensor | None = None if mineral is None else mineral[own]
             b, slope = without_components(lines[own], [(slice(None), source.shares)], source.beam, mineral=part)
             corrected[own], counted[own] = b, weights[own] * slope**2
-        volume = pwls(system, corrected, counted, config, mask=unknown, initial=volume, spacing=grid.spacing).volume
+        volume = pwls(
+            system, corrected, counted, config, mask=unknown, initial=volume, roughness=VoxelRoughness(grid.spacing)
+        ).volume
     return volume
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.geometry import ConeBeamGeometry, TwoLevelGrid, VolumeGrid
 from torchkcreg.projector import project_points
 from torchkcreg.scene import KnownComponent
 
@@ -22,14 +22,16 @@ def known_materials(components: Sequence[KnownComponent]) -> list[str]:
     return list(dict.fromkeys(component.material for component in components))
 
 
-def unknown_share(components: Sequence[KnownComponent], grid: VolumeGrid) -> Tensor:
-    """The mask s (D, H, W): the share of each voxel that no component fills.
+def unknown_share(components: Sequence[KnownComponent], grid: VolumeGrid | TwoLevelGrid) -> Tensor:
+    """The mask s, (D, H, W) or (N,) on two levels: the share of each voxel that no component fills.
 
     >>> import trimesh
     >>> ball = KnownComponent.from_mesh(trimesh.creation.icosphere(2, 3.0), "steel", pitch=0.5)
     >>> unknown_share([ball], VolumeGrid.centered((3, 3, 3), 1.0))[1, 1, 1].item()
     0.0
     """
+    if isinstance(grid, TwoLevelGrid):
+        return grid.join(unknown_share(components, grid.coarse), unknown_share(components, grid.fine))
     filled = sum((component.fraction(grid) for component in components), torch.zeros(grid.shape))
     share = (1 - filled).clamp(0, 1)
     return torch.where(filled > COVERED, torch.zeros_like(share), share)

@@ -14,7 +14,7 @@ from torchkcreg.callbacks import Callback
 
 from .pwls_config import PWLSConfig
 from .reconstructed import Reconstruction
-from .roughness import quadratic_roughness, roughness_curvature, roughness_gradient
+from .roughness import Roughness, VoxelRoughness
 from .sharding import ViewShard
 from .subsets import ordered_subsets
 from .system import System
@@ -35,10 +35,10 @@ class PWLS:
         line_integrals: l, (V, rows, cols).
         weights: w, same shape, not negative; see `statistical_weights`.
         config: iterations, subsets, beta, ...
-        mask: s, (D, H, W) between 0 and 1, the share of each voxel that is unknown; 1 if None. What is masked is filled
-            smoothly by the roughness.
-        initial: start volume (D, H, W); zeros if None.
-        spacing: of the voxels (x, y, z), mm, for the roughness.
+        mask: s, of the volumes' shape, between 0 and 1, the share of each voxel that is unknown; 1 if None. What
+            is masked is filled smoothly by the roughness.
+        initial: start volume; zeros if None.
+        roughness: R; of cubes if None.
         shard: the share of the views that this process works on.
 
     Raises:
@@ -54,12 +54,13 @@ class PWLS:
         *,
         mask: Tensor | None = None,
         initial: Tensor | None = None,
-        spacing: Sequence[float] = (1.0, 1.0, 1.0),
+        roughness: Roughness | None = None,
         shard: ViewShard | None = None,
     ) -> None:
         self.system, self.config = system, config or PWLSConfig()
         self.data, self.weights, self.mask, self.initial = line_integrals, weights, mask, initial
-        self.spacing, self.shard = tuple(spacing), shard
+        self.roughness: Roughness = roughness or VoxelRoughness()
+        self.shard = shard
         self._check(initial)
         shape = tuple(system.volume_shape)
         self.volume = line_integrals.new_zeros(shape) if initial is None else initial.to(line_integrals).clone()
@@ -117,7 +118,7 @@ class PWLS:
         data = self._masked(self._total(total))
         if not bool((data > 0).any()):
             raise ValueError("the volume lies outside the field of view: no ray of any weight crosses it")
-        rough = self.config.beta * roughness_curvature(self.volume, spacing=self.spacing)
+        rough = self.config.beta * self.roughness.curvature(self.volume)
         return (data + rough).clamp_min(1e-6 * float(data.max()))
 
     def _blocks(self) -> list[list[int]]:
@@ -131,7 +132,7 @@ class PWLS:
         for views in self._blocks():
             residual = self.system.project(self._masked(volume), views) - self.data[views]
             misfit += 0.5 * (self.weights[views] * residual.square()).sum(dtype=torch.float64)
-        return float(self._total(misfit)) + self.config.beta * float(quadratic_roughness(volume, spacing=self.spacing))
+        return float(self._total(misfit)) + self.config.beta * float(self.roughness.value(volume))
 
     def step(self) -> dict[str, Any]:
         """One iteration; returns its record."""
@@ -141,7 +142,7 @@ class PWLS:
             self.ahead, self.pace = self.volume.clone(), 1.0  # the momentum of other subsets' errors is none
         subsets = ordered_subsets(self.system.num_views, stage.subsets, sources=self.system.sources)
         misfit = sum(self._sub_iteration(v, self.system.num_views / len(v), stage.momentum) for v in subsets)
-        rough = float(quadratic_roughness(self.volume, spacing=self.spacing))
+        rough = float(self.roughness.value(self.volume))
         self.iteration += 1
         every = self.config.objective_every
         record = {
@@ -165,7 +166,7 @@ class PWLS:
             misfit += 0.5 * (weighted * residual).sum(dtype=torch.float64)
             gradient += self.system.backproject(weighted, own)
         gradient = self._masked(self._total(gradient)).mul_(scale)
-        gradient.add_(roughness_gradient(point, spacing=self.spacing), alpha=self.config.beta)
+        gradient.add_(self.roughness.gradient(point), alpha=self.config.beta)
         stepped = point - gradient.div_(self.curvature)
         if self.config.nonnegative:
             stepped.clamp_(min=0)

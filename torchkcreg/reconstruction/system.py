@@ -18,13 +18,13 @@ class System(Protocol):
     """A linear projector by views. Bring your own, or take `VoxelSystem`.
 
     Attributes:
-        volume_shape: (D, H, W) of the volumes.
+        volume_shape: of the volumes: (D, H, W), or what else the projector knows, such as (N,) of two levels of voxels.
         num_views: V.
         sources: label of each view's focal spot, or None; ordered subsets then hold all of them evenly.
     """
 
     @property
-    def volume_shape(self) -> tuple[int, int, int]:
+    def volume_shape(self) -> tuple[int, ...]:
         """(D, H, W)."""
 
     @property

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .pwls_config import PWLSConfig
-from .roughness import roughness_curvature, roughness_gradient
+from .roughness import VoxelRoughness
 from .spectral import BeamModel
 from .subsets import ordered_subsets
 from .system import BLOCK_VIEWS, System
@@ -51,7 +51,7 @@ class TwoMaterials:
         start: Tensor,
     ) -> None:
         self.system, self.lines, self.weights, self.unknown = system, lines, weights, unknown
-        self.config, self.spacing = config, tuple(spacing)
+        self.config, self.roughness = config, VoxelRoughness(spacing)
         self.place = {view: (source, n) for source in sources for n, view in enumerate(source.views)}
         self.x, self.ahead, self.pace, self.iteration = start, start.clone(), 1.0, 0
         typical = torch.stack([source.basis.mean(1) for source in sources]).mean(0)
@@ -85,7 +85,7 @@ class TwoMaterials:
             _, slopes = self._modelled(self._paths(self.x, views), views)
             for row, product in enumerate((slopes[0] ** 2, slopes[0] * slopes[1], slopes[1] ** 2)):
                 total[row] += self._masked(self.system.backproject(lengths * product, views))
-        rough = roughness_curvature(ones, spacing=self.spacing)
+        rough = self.roughness.curvature(ones)
         for row, beta in ((0, self.beta[0]), (2, self.beta[1])):
             total[row] += beta * rough + 1e-6 * total[row].max()
         return total
@@ -105,7 +105,7 @@ class TwoMaterials:
             gradient = torch.stack(
                 [
                     scale * self._masked(self.system.backproject(weighted * slope, views))
-                    + beta * roughness_gradient(part, spacing=self.spacing)
+                    + beta * self.roughness.gradient(part)
                     for slope, part, beta in zip(slopes, point, self.beta.tolist())
                 ]
             )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.callbacks import Callback
-from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.geometry import ConeBeamGeometry, TwoLevelGrid, VolumeGrid
 from torchkcreg.physics import Beam, Veil
 from torchkcreg.scene import KnownComponent
 
@@ -19,9 +19,11 @@ from .known_component import component_shares, unknown_share
 from .preparation import PreparedData, prepare
 from .pwls import PWLS
 from .pwls_config import PWLSConfig
+from .roughness import VoxelRoughness
 from .sharding import ViewShard
 from .spectral import BeamModel, mineral_part, transmitted_behind
 from .system import VoxelSystem, projected
+from .two_levels import TwoLevelRoughness, TwoLevelSystem
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,9 @@ class IterativeResult:
     """A reconstruction from transmissions.
 
     Attributes:
-        volume: attenuation of the background (D, H, W) at the beam's reference energy, 1/mm; smooth inside metal.
-        mask: share of each voxel that is background; None without components.
+        volume: attenuation of the background (D, H, W) at the beam's reference energy, 1/mm; smooth inside metal. On a
+            `TwoLevelGrid` an image (N,), see `TwoLevelGrid.volumes`.
+        mask: share of each voxel that is background, of the volume's shape; None without components.
         data: line integrals and weights of the last pass.
         scatter: in units of the open beam, (V, rows, cols).
         history: records of the last pass.
@@ -46,7 +49,7 @@ class IterativeResult:
 def reconstruct(
     transmission: Tensor,
     geometry: ConeBeamGeometry,
-    grid: VolumeGrid,
+    grid: VolumeGrid | TwoLevelGrid,
     beam: BeamModel | Beam,
     *,
     config: PWLSConfig | None = None,
@@ -70,14 +73,14 @@ def reconstruct(
     Args:
         transmission: measured intensity over the open beam's, (V, rows, cols).
         geometry: the views.
-        grid: the voxels.
+        grid: the voxels; of two levels, only the last pass is made on both, the others on the coarse one.
         beam: energies, and the attenuation of the components' materials, such as a registration's own.
         config: of each pass.
         components: metal in its registered place; none: plain PWLS.
         scatter: see `prepare`.
         mask: 0 where a pixel holds no measurement.
         passes: how many; 1 keeps the first estimates.
-        initial: start volume of the first pass.
+        initial: start volume (D, H, W) of the first pass.
         blur_sigma_px: the system's blur, detector pixels.
         shard: the share of the views that this process works on.
         backend: of the projectors.
@@ -88,8 +91,9 @@ def reconstruct(
     if passes < 1:
         raise ValueError(f"passes must be at least 1, got {passes}")
     beam = BeamModel.behind(beam) if isinstance(beam, Beam) else beam
-    system = VoxelSystem(geometry, grid, backend=backend)
-    unknown = unknown_share(components, grid).to(transmission) if components else None
+    coarse = grid.coarse if isinstance(grid, TwoLevelGrid) else grid
+    system = VoxelSystem(geometry, coarse, backend=backend)
+    unknown = unknown_share(components, coarse).to(transmission) if components else None
     first = scatter = scatter_image(transmission, scatter, geometry.pixel_spacing)
     shares = list(
         component_shares(components, geometry, beam, blur_sigma_px=blur_sigma_px, backend=backend)
@@ -105,32 +109,42 @@ def reconstruct(
                 visible = volume if unknown is None else volume * unknown
                 seen = projected(system, visible)
                 scatter = _refined(transmission, first, seen, mineral, shares, beam, geometry.pixel_spacing)
-        data = prepare(
-            transmission,
-            geometry,
-            beam,
-            shares=shares,
-            scatter=scatter,
-            mask=mask,
-            mineral=mineral,
-        )
-        solver = PWLS(
-            system,
-            data.line_integrals,
-            data.weights,
-            config,
-            mask=unknown,
-            initial=volume,
-            spacing=grid.spacing,
-            shard=shard,
-        )
+        data = prepare(transmission, geometry, beam, shares=shares, scatter=scatter, mask=mask, mineral=mineral)
+        level = grid if index == passes - 1 else coarse
+        solver = _solver(system, data, level, config, components, unknown, volume, shard)
         if state is not None and index == start and state.get("solver") is not None:
             solver.load_state_dict(state["solver"])
         volume = solver.run(callbacks=callbacks, number=index, progress=progress).volume
-        done = IterativeResult(volume, unknown, data, scatter, solver.history)
+        done = IterativeResult(volume, solver.mask if components else None, data, scatter, solver.history)
     if done is None:
         raise ValueError(f"the state is of pass {start}, but there are only {passes}")
     return done
+
+
+def _solver(
+    system: VoxelSystem,
+    data: PreparedData,
+    grid: VolumeGrid | TwoLevelGrid,
+    config: PWLSConfig | None,
+    components: Sequence[KnownComponent],
+    unknown: Tensor | None,
+    initial: Tensor | None,
+    shard: ViewShard | None,
+) -> PWLS:
+    """Of a pass on one level or two, from a coarse volume."""
+    inputs = data.line_integrals, data.weights, config
+    if not isinstance(grid, TwoLevelGrid):
+        rough = VoxelRoughness(grid.spacing)
+        return PWLS(system, *inputs, mask=unknown, initial=initial, roughness=rough, shard=shard)
+    mask = (unknown_share(components, grid) if components else grid.active).to(data.weights)
+    return PWLS(
+        TwoLevelSystem(system.geometry, grid, backend=system.backend),
+        *inputs,
+        mask=mask,
+        initial=None if initial is None else grid.divide(initial),
+        roughness=TwoLevelRoughness(grid),
+        shard=shard,
+    )
 
 
 def _refined(
