@@ -219,6 +219,8 @@ def test_beam_and_blur_may_be_what_the_registration_found(small_run, tmp_path):
 def test_wrong_input_is_one_line_that_names_it(ball_scan, small_run, tmp_path, capsys):
     assert main(arguments(ball_scan, tmp_path / "a", "--method", "kcrec")) == 2
     assert "needs the run of a registration" in capsys.readouterr().err
+    assert main(["reconstruct", "--run", str(small_run), "--out", str(small_run), "--overwrite"]) == 2
+    assert "would be overwritten" in capsys.readouterr().err and (small_run / "deformation.json").exists()
     assert main(["reconstruct", "--run", str(small_run), "--out", str(tmp_path / "b"), "--scatter", "none"]) == 2
     assert "needs at least 3 views" in capsys.readouterr().err
     assert main(arguments(ball_scan, tmp_path / "c", "--size", 10, -1, 10)) == 2

@@ -157,7 +157,7 @@ def _add_reconstruct(commands) -> None:
     command.add_argument("--window", help="of the ramp: ram-lak, shepp-logan, cosine, hamming or hann (default)")
     command.add_argument("--scatter", help="auto (default), run (as found), none, or its fraction")
     command.add_argument("--monoenergetic", action="store_true", default=None, help="one energy, as in the paper")
-    streamed = "read some views at a time, of scans larger than memory (fdk and kcmar; NPY, uncompressed MHA)"
+    streamed = "read some views at a time, of scans larger than memory (NPY, uncompressed MHA)"
     command.add_argument("--stream", action="store_true", default=None, help=streamed)
     estimated = "given (default), run (as hard as found), or estimate: where spectrum or alloy are not known"
     command.add_argument("--beam", choices=("given", "run", "estimate"), help=estimated)

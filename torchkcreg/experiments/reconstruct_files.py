@@ -85,13 +85,15 @@ def reconstruct_files(
         FileExistsError: If ``out`` holds a run and neither overwrite nor resume was asked.
     """
     start = time.perf_counter()
+    if files.run is not None and out.resolve() == files.run.resolve():
+        raise ValueError(f"out must not be the registration's folder {files.run}: it would be overwritten")
     inputs = read_reconstruction_inputs(files, options)
     with processes() as rank:
         shard = ViewShard.of(inputs.geometry.num_views) if distributed.is_initialized() else None
         record = _record(files, options)
         run = _folder(out, record, overwrite=overwrite, resume=resume) if rank == 0 else None
         state = RunFolder(out).load_checkpoint() if resume else None
-        levels, history = _reconstructed(files, inputs, options, shard, run, state)
+        levels, history = _reconstructed(files, inputs, options, shard, run, state, out)
         metrics = _metrics(inputs, options, levels, history, time.perf_counter() - start)
         if run is not None:
             _write(run, inputs, options, levels, metrics, figures)
@@ -105,6 +107,7 @@ def _reconstructed(
     shard: ViewShard | None,
     run: RunFolder | None,
     state: dict[str, Any] | None,
+    out: Path,
 ) -> tuple[list[tuple[Tensor, VolumeGrid]], list[dict[str, Any]]]:
     """The volume and its grid, and where voxels are divided those near the metal as well; records of the iterations."""
     geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
@@ -126,14 +129,14 @@ def _reconstructed(
         metal = 1 - unknown_share(inputs.components, grid)
         levels = TwoLevelGrid.near(metal, grid, within_mm=options.refine_within_mm, factor=options.refine)
     result = reconstruct(
-        inputs.transmission,
+        inputs.transmission if inputs.file is None else inputs.read,
         geometry,
         levels or grid,
         inputs.beam,
         config=config,
         components=inputs.components,
         scatter=inputs.scatter,
-        mask=inputs.mask,
+        mask=inputs.mask if inputs.file is None else None,
         passes=options.num_passes,
         initial=initial,
         blur_sigma_px=inputs.blur_sigma_px,
@@ -142,6 +145,7 @@ def _reconstructed(
         callbacks=[] if run is None else [_Checkpoints(run, config.iterations)],
         state=state,
         progress=None if run is not None else False,
+        folder=None if inputs.file is None else out,
     )
     if levels is None:
         return [(result.volume, grid)], result.history

@@ -71,6 +71,11 @@ class ReconstructionInputs:
         transmission = torch.exp(-filled(part.line_integrals, part.mask))
         return replace(self, geometry=self.geometry.select(views), transmission=transmission, mask=part.mask, file=None)
 
+    def read(self, views: list[int]) -> tuple[Tensor, Tensor]:
+        """Transmission and mask (v, rows, cols) of some views, read from the file."""
+        part = self.of_views(views)
+        return part.transmission, part.mask
+
 
 def read_reconstruction_inputs(files: ReconstructionFiles, options: ReconstructionOptions) -> ReconstructionInputs:
     """The inputs of a reconstruction; nothing is written.
@@ -160,8 +165,6 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
 def _file(
     path: Path, open_beam: float | None, geometry: ConeBeamGeometry, options: ReconstructionOptions
 ) -> ProjectionFile:
-    if not options.is_filtered:
-        raise ValueError(f"views are streamed for fdk and kcmar; {options.method} goes through them many times")
     if options.scatter == "run" or options.beam == "estimate":
         raise ValueError("the run's scatter, or an estimated beam, need all views at once: leave out stream")
     file = ProjectionFile(path, open_beam=open_beam)

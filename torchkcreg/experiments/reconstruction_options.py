@@ -58,7 +58,8 @@ class ReconstructionOptions(Config):
         beam: "given" is the spectrum of the file and the materials of the run, or a likely one; "run" is the same, as
             hard as the registration found it; "estimate" is what the
             metal's shadow tells of a spectrum, or an implant's material, that nobody knows (methods with components).
-        stream: Views are read some at a time, of scans that are larger than memory ("fdk" and "kcmar").
+        stream: Views are read some at a time, of scans that are larger than memory; iterative methods keep what they
+            make of them in files in the folder, for as long as they run.
         material: The implant's, where the registration had none.
         single_material: What the object is of, where it is of one material alone, such as an implant on a bench: "fdk"
             gives the share of it in each voxel, without beam hardening.

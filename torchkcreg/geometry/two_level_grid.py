@@ -134,6 +134,12 @@ class TwoLevelGrid:
         """Coarse values (D, H, W) at the fine voxels of the box, (d, h, w), linearly between the voxels' centres."""
         return interpolate(coarse[self.box][None, None], scale_factor=self.factor, mode="trilinear")[0, 0]
 
+    def interpolated_adjoint(self, fine: Tensor) -> Tensor:
+        """The adjoint of `interpolated` without its zeros: fine values (d, h, w) to the coarse voxels of the box."""
+        for dim in (2, 1, 0):
+            fine = _shared(fine, self.factor, dim)
+        return fine
+
     def __repr__(self) -> str:
         return f"TwoLevelGrid({self.coarse}, {int(self.divided.sum())} divided, factor={self.factor})"
 
@@ -145,6 +151,18 @@ def means(fine: Tensor, factor: int) -> Tensor:
 
 def repeated(coarse: Tensor, factor: int) -> Tensor:
     """Each value (d, h, w) factor^3 times: the fine values of blocks."""
-    for dim in range(3):
-        coarse = coarse.repeat_interleave(factor, dim)
-    return coarse
+    wide = coarse[:, None, :, None, :, None].expand(-1, factor, -1, factor, -1, factor)
+    return wide.reshape([count * factor for count in coarse.shape])
+
+
+def _shared(fine: Tensor, factor: int, dim: int) -> Tensor:
+    """The adjoint of linear interpolation along a dimension, from each coarse value to `factor` fine ones."""
+    offsets = (torch.arange(factor, dtype=fine.dtype, device=fine.device) - (factor - 1) / 2) / factor
+    weights = torch.stack([1 - offsets.abs(), (-offsets).clamp_min(0), offsets.clamp_min(0)], dim=-1)
+    own, before, after = torch.tensordot(fine.unflatten(dim, (-1, factor)), weights, dims=([dim + 1], [0])).unbind(-1)
+    own, last = own.clone(), own.shape[dim] - 1
+    own.narrow(dim, 0, last).add_(before.narrow(dim, 1, last))
+    own.narrow(dim, 1, last).add_(after.narrow(dim, 0, last))
+    own.narrow(dim, 0, 1).add_(before.narrow(dim, 0, 1))  # beyond the ends is what is at the ends
+    own.narrow(dim, last, 1).add_(after.narrow(dim, last, 1))
+    return own

@@ -81,12 +81,15 @@ class PWLS:
             raise ValueError(
                 f"weights must have the line integrals' shape {tuple(data.shape)}, got {tuple(weights.shape)}"
             )
-        for name, tensor in (("line_integrals", data), ("weights", weights)):
-            if not bool(tensor.isfinite().all()):
+        least = torch.stack([view.min() for view in weights])  # view by view: there may be more than memory holds
+        most = torch.stack([view.max() for view in weights])
+        sums = torch.stack([view.sum() for view in data])
+        for name, values in (("line_integrals", sums), ("weights", least + most)):
+            if not bool(values.isfinite().all()):
                 raise ValueError(
                     f"{name} must be finite; give pixels without a measurement weight 0 and any finite value"
                 )
-        if bool((weights < 0).any()) or not bool((weights > 0).any()):
+        if bool((least < 0).any()) or not bool((most > 0).any()):
             raise ValueError("weights must not be negative, and some must be above zero")
         for name, volume in (("mask", self.mask), ("initial", initial)):
             if volume is not None and (tuple(volume.shape) != shape or not bool(volume.isfinite().all())):

@@ -67,10 +67,7 @@ class TwoLevelSystem(nn.Module):
         shares = (images / n**2).repeat_interleave(n, 1).repeat_interleave(n, 2)
         fine = self.fine.backproject(shares, views).mul_(grid.within)
         filled = self.coarse.backproject(images, views)
-        with torch.enable_grad():  # the adjoint of the interpolation is its gradient
-            zero = torch.zeros_like(filled, requires_grad=True)
-            (back,) = torch.autograd.grad(grid.interpolated(zero), zero, fine)
-        filled -= back
+        filled[grid.box] -= grid.interpolated_adjoint(fine)
         fine[:] += repeated(filled[grid.box] * grid.divided[grid.box], grid.factor) / grid.factor**3
         return grid.join(filled, fine)
 

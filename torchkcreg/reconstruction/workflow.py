@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import ConeBeamGeometry, TwoLevelGrid, VolumeGrid
@@ -20,9 +22,10 @@ from .preparation import PreparedData, prepare
 from .pwls import PWLS
 from .pwls_config import PWLSConfig
 from .roughness import VoxelRoughness
+from .scan_views import ReadViews, Workspace, views_reader
 from .sharding import ViewShard
 from .spectral import BeamModel, mineral_part, transmitted_behind
-from .system import VoxelSystem, projected
+from .system import VoxelSystem
 from .two_levels import TwoLevelRoughness, TwoLevelSystem
 
 
@@ -47,7 +50,7 @@ class IterativeResult:
 
 
 def reconstruct(
-    transmission: Tensor,
+    transmission: Tensor | ReadViews,
     geometry: ConeBeamGeometry,
     grid: VolumeGrid | TwoLevelGrid,
     beam: BeamModel | Beam,
@@ -64,6 +67,7 @@ def reconstruct(
     callbacks: Sequence[Callback] = (),
     state: dict[str, Any] | None = None,
     progress: bool | None = False,
+    folder: Path | None = None,
 ) -> IterativeResult:
     """PWLS of transmissions, with known components KC-Rec: ``mu_total = s mu + mu_implant``.
 
@@ -71,7 +75,8 @@ def reconstruct(
     volume what of a ray is mineral and, behind known metal, how much of the signal must be scatter.
 
     Args:
-        transmission: measured intensity over the open beam's, (V, rows, cols).
+        transmission: measured intensity over the open beam's, (V, rows, cols). For scans that are larger than memory a
+            function: called with a list of views, it gives their transmission and mask, (v, rows, cols) each.
         geometry: the views.
         grid: the voxels; of two levels, only the last pass is made on both, the others on the coarse one.
         beam: energies, and the attenuation of the components' materials, such as a registration's own.
@@ -87,38 +92,99 @@ def reconstruct(
         callbacks: called at the start and end of each pass and after each iteration; the run is the solver.
         state: where an earlier run stopped: "pass", "solver" (its state dict) and "volume", that of the pass before.
         progress: see `PWLS.run`.
+        folder: for line integrals, weights and scatter of scans that are larger than memory; memory if None.
     """
     if passes < 1:
         raise ValueError(f"passes must be at least 1, got {passes}")
     beam = BeamModel.behind(beam) if isinstance(beam, Beam) else beam
     coarse = grid.coarse if isinstance(grid, TwoLevelGrid) else grid
     system = VoxelSystem(geometry, coarse, backend=backend)
-    unknown = unknown_share(components, coarse).to(transmission) if components else None
-    first = scatter = scatter_image(transmission, scatter, geometry.pixel_spacing)
-    shares = list(
-        component_shares(components, geometry, beam, blur_sigma_px=blur_sigma_px, backend=backend)
-    )  # the same in all passes
-    volume, start, done = initial, 0, None
+    shape = (geometry.num_views, *geometry.det_shape)
+    read, kept = views_reader(transmission, mask, shape), isinstance(transmission, Tensor)
+    views = _Views(system, read, beam, components, scatter, blur_sigma_px, keep_shares=kept)
+    space, volume, start, done = Workspace(folder), initial, 0, None
     if state is not None:
         start, volume = int(state["pass"]), state["volume"]
     for index in range(start, passes):
-        mineral = None
-        if index > 0 and volume is not None:
-            mineral = projected(system, mineral_part(volume, beam, mask=unknown))
-            if components:
-                visible = volume if unknown is None else volume * unknown
-                seen = projected(system, visible)
-                scatter = _refined(transmission, first, seen, mineral, shares, beam, geometry.pixel_spacing)
-        data = prepare(transmission, geometry, beam, shares=shares, scatter=scatter, mask=mask, mineral=mineral)
+        data, scattered = views.prepared(volume if index > 0 else None, space, progress=progress)
         level = grid if index == passes - 1 else coarse
-        solver = _solver(system, data, level, config, components, unknown, volume, shard)
+        solver = _solver(system, data, level, config, components, views.unknown, volume, shard)
         if state is not None and index == start and state.get("solver") is not None:
             solver.load_state_dict(state["solver"])
         volume = solver.run(callbacks=callbacks, number=index, progress=progress).volume
-        done = IterativeResult(volume, solver.mask if components else None, data, scatter, solver.history)
+        done = IterativeResult(volume, solver.mask if components else None, data, scattered, solver.history)
     if done is None:
         raise ValueError(f"the state is of pass {start}, but there are only {passes}")
     return done
+
+
+class _Views:
+    """A scan's views, some at a time, on their way to line integrals and weights."""
+
+    def __init__(
+        self,
+        system: VoxelSystem,
+        read: ReadViews,
+        beam: BeamModel,
+        components: Sequence[KnownComponent],
+        scatter: Veil | Tensor | None,
+        blur_sigma_px: float,
+        *,
+        keep_shares: bool,
+    ) -> None:
+        self.system, self.read, self.beam, self.components = system, read, beam, components
+        self.scatter, self.blur_sigma_px = scatter, blur_sigma_px
+        self.like = read([0])[0]
+        self.unknown = unknown_share(components, system.grid).to(self.like) if components else None
+        self.keep_shares = keep_shares
+        self.kept: list[tuple[slice, Tensor]] | None = None
+
+    def shares(self) -> Iterable[tuple[slice, Tensor]]:
+        """Blocks of views, and what metal lets through in them; kept from pass to pass where there is the memory."""
+        if self.kept is not None:
+            return self.kept
+        backend, blur = self.system.backend, self.blur_sigma_px
+        shares = component_shares(self.components, self.system.geometry, self.beam, blur_sigma_px=blur, backend=backend)
+        if not self.keep_shares:
+            return shares
+        self.kept = list(shares)
+        return self.kept
+
+    def prepared(
+        self, volume: Tensor | None, space: Workspace, *, progress: bool | None
+    ) -> tuple[PreparedData, Tensor]:
+        """Line integrals and weights of all views, and their scatter, with what a volume (D, H, W) tells of them."""
+        geometry = self.system.geometry
+        lines, weights, scattered = (
+            space.empty((geometry.num_views, *geometry.det_shape), self.like) for _ in range(3)
+        )
+        seen = mineral = None
+        if volume is not None:
+            mineral = mineral_part(volume, self.beam, mask=self.unknown)
+            seen = None if self.unknown is None else volume * self.unknown
+        bar = tqdm(total=geometry.num_views, desc="views", disable=None if progress is None else not progress)
+        for block, share in self.shares():
+            views = list(range(geometry.num_views))[block]
+            transmission, mask = self.read(views)
+            own, share = self.scatter, share.to(transmission)
+            first = scatter_image(transmission, own[views] if isinstance(own, Tensor) else own, geometry.pixel_spacing)
+            hard = None if mineral is None else self.system.project(mineral, views)
+            if seen is not None and hard is not None:
+                first = self._refined(transmission, first, self.system.project(seen, views), hard, share)
+            blocks = [(slice(None), share)]
+            part = prepare(
+                transmission, geometry.select(views), self.beam, shares=blocks, scatter=first, mask=mask, mineral=hard
+            )
+            lines[block], weights[block], scattered[block] = part.line_integrals, part.weights, first
+            bar.update(len(views))
+        bar.close()
+        return PreparedData(lines, weights), scattered
+
+    def _refined(self, transmission: Tensor, scatter: Tensor, seen: Tensor, mineral: Tensor, share: Tensor) -> Tensor:
+        """The scatter that must be in the metal's shadow for what is measured there to be what the volume shows."""
+        lines, _ = transmitted_behind(seen, share, self.beam, mineral=mineral)
+        spacing = self.system.geometry.pixel_spacing
+        return refined_scatter(transmission, scatter, torch.exp(-lines), share.sum(0), spacing)
 
 
 def _solver(
@@ -145,21 +211,3 @@ def _solver(
         roughness=TwoLevelRoughness(grid),
         shard=shard,
     )
-
-
-def _refined(
-    transmission: Tensor,
-    scatter: Tensor,
-    background: Tensor,
-    mineral: Tensor,
-    shares: Sequence[tuple[slice, Tensor]],
-    beam: BeamModel,
-    pixel_spacing: Sequence[float],
-) -> Tensor:
-    refined = scatter.clone()
-    for block, share in shares:
-        share = share.to(transmission)
-        line_integrals, _ = transmitted_behind(background[block], share, beam, mineral=mineral[block])
-        primary = torch.exp(-line_integrals)
-        refined[block] = refined_scatter(transmission[block], scatter[block], primary, share.sum(0), pixel_spacing)
-    return refined

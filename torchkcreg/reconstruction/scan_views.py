@@ -1,0 +1,60 @@
+"""The views of a scan, block by block, from memory or as they are read; what is made of them, in memory or on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+ReadViews = Callable[[list[int]], tuple[Tensor, Tensor | None]]
+
+
+def views_reader(transmission: Tensor | ReadViews, mask: Tensor | None, shape: Sequence[int]) -> ReadViews:
+    """A function of views that gives their transmission and mask, both (v, rows, cols), or None where all pixels hold.
+
+    Args:
+        transmission: of all views, (V, rows, cols), or such a function already.
+        mask: 0 where a pixel holds no measurement, (V, rows, cols); every pixel does if None.
+        shape: (V, rows, cols) as they must be.
+
+    Raises:
+        ValueError: a transmission of another shape, or a mask beside a function, which gives its own.
+    """
+    if not isinstance(transmission, Tensor):
+        if mask is not None:
+            raise ValueError("a function of views gives their masks as well: leave out mask")
+        return transmission
+    for name, tensor in (("transmission", transmission), ("mask", mask)):
+        if tensor is not None and tuple(tensor.shape) != tuple(shape):
+            raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(tensor.shape)}")
+
+    def read(views: list[int]) -> tuple[Tensor, Tensor | None]:
+        return transmission[views], None if mask is None else mask[views]
+
+    return read
+
+
+class Workspace:
+    """Where large arrays of a scan go: memory, or files in a folder, of which the system keeps what fits in memory.
+
+    Args:
+        folder: an existing folder; memory if None. The arrays' files are unlinked as soon as they are open, so that
+            nothing is left behind.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.folder = folder
+
+    def empty(self, shape: Sequence[int], like: Tensor) -> Tensor:
+        """An array of a shape, of another's type, to be filled."""
+        if self.folder is None:
+            return like.new_empty(tuple(shape))
+        size = 1
+        for count in shape:
+            size *= int(count)
+        path = self.folder / f"array-{id(self)}-{size}"
+        array = torch.from_file(str(path), shared=True, size=size, dtype=like.dtype, device="cpu")
+        path.unlink()
+        return array.view(tuple(shape))
