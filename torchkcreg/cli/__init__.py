@@ -14,6 +14,7 @@ from torchkcreg.console import one_line, run_command
 
 from .command import add_command
 from .compare import add_compare
+from .convert import add_convert
 from .densitometry import add_densitometry
 from .experiment import add_experiment
 from .load import add_load
@@ -58,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     add_load(commands)
     add_densitometry(commands)
     add_compare(commands)
+    add_convert(commands)
     add_plan(commands)
     add_simulate(commands)
     add_experiment(commands)

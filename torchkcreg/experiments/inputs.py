@@ -159,7 +159,7 @@ def _device(name: str) -> Tensor:
 
 
 def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationData:
-    geometry = read_geometry(files.geometry)
+    geometry = read_geometry(files.geometry, projections=files.projections)
     projections = read_projections(files.projections, open_beam=files.open_beam)
     projections.check_against(geometry)
     if files.views is not None:

@@ -87,7 +87,7 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     files = _completed(files)
     if files.geometry is None or files.projections is None:
         raise ValueError("a reconstruction needs geometry and projections, or a run that names them")
-    geometry = read_geometry(files.geometry)
+    geometry = read_geometry(files.geometry, projections=files.projections)
     file = _file(files.projections, files.open_beam, geometry, options) if options.stream else None
     if file is None:
         projections, shown = read_projections(files.projections, open_beam=files.open_beam), geometry

@@ -7,6 +7,7 @@ else about it (source, rays, pixel positions) is derived from that.
 from torchkcreg.geometry.calibration import Calibration, calibrate
 from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
+from torchkcreg.geometry.frames import DetectorFrames, from_astra, from_leap, gantry_about_z, to_astra, to_leap
 from torchkcreg.geometry.multisource import MultisourceScanner
 from torchkcreg.geometry.principal import principal_axes
 from torchkcreg.geometry.se3 import (
@@ -25,6 +26,7 @@ from torchkcreg.geometry.volume_grid import VolumeGrid
 __all__ = [
     "Calibration",
     "ConeBeamGeometry",
+    "DetectorFrames",
     "MultisourceScanner",
     "TwoLevelGrid",
     "VolumeGrid",
@@ -32,12 +34,17 @@ __all__ = [
     "calibrate",
     "circular_geometry",
     "fit_rigid",
+    "from_astra",
+    "from_leap",
+    "gantry_about_z",
     "invert_rigid",
     "matrices_from_frames",
     "principal_axes",
     "rigid_matrix",
     "rotation_about",
     "rotation_from_vector",
+    "to_astra",
+    "to_leap",
     "transform_points",
     "vector_from_rotation",
 ]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchkcreg.geometry.circular import matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
+from torchkcreg.geometry.frames import DetectorFrames
 from torchkcreg.geometry.se3 import rotation_from_vector
 
 LIKELY_SHIFT_MM = 20.0  # standard deviations of what is told about a detector's place
@@ -102,17 +103,13 @@ class _Fit:
 
     def __init__(self, geometry: ConeBeamGeometry, measured: NDArray, seen: NDArray) -> None:
         self.geometry, self.measured, self.seen = geometry, measured, seen
-        inverse = torch.linalg.inv(geometry.projection_matrices.detach().cpu()[:, :, :3])
-        distances = geometry.detector_distances.detach().cpu()
-        self.sources = geometry.source_positions.detach().cpu()
-        rows, cols = geometry.det_shape
-        middle = torch.tensor([(cols - 1) / 2, (rows - 1) / 2, 1.0], dtype=torch.float64)
-        self.centers = self.sources + distances[:, None] * (inverse @ middle)
-        across, down = (torch.nn.functional.normalize(inverse[:, :, i], dim=-1) for i in (0, 1))
+        frames = DetectorFrames.of(geometry)
+        self.sources, self.centers = frames.sources.cpu(), frames.centers.cpu()
+        across, down = (torch.nn.functional.normalize(x.cpu(), dim=-1) for x in (frames.col_steps, frames.row_steps))
         normal = torch.linalg.cross(across, down)
         away = ((self.centers - self.sources) * normal).sum(-1, keepdim=True).sign()
         self.frames = torch.stack([across, down, away * normal], dim=-1)
-        scale = float(distances.mean())
+        scale = float(geometry.detector_distances.mean())
         self.likely = np.array([*[LIKELY_SHIFT_MM] * 2, LIKELY_DISTANCE * scale, *[LIKELY_TURN_DEG] * 3])
         self.noise = 1.0
 

@@ -10,12 +10,14 @@ from .figures import write_figure
 from .files import read_json, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .init import read_init, write_init
+from .matrix_tables import read_matrix_table, write_matrix_table
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
 from .plausible import implausible_magnification
 from .points import read_points, write_points
 from .projection_file import ProjectionFile
 from .projections import Projections, read_projections, write_projections
 from .references import read_reference
+from .rtk_geometry import read_rtk, write_rtk
 from .runs import RunFolder, read_run
 from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
@@ -37,10 +39,12 @@ __all__ = [
     "read_geometry",
     "read_init",
     "read_json",
+    "read_matrix_table",
     "read_mesh",
     "read_points",
     "read_projections",
     "read_reference",
+    "read_rtk",
     "read_run",
     "read_spectrum",
     "read_volume",
@@ -53,10 +57,12 @@ __all__ = [
     "write_init",
     "write_itk_transform",
     "write_json",
+    "write_matrix_table",
     "write_mesh",
     "write_point_cloud_ply",
     "write_points",
     "write_projections",
+    "write_rtk",
     "write_spectrum",
     "write_surface_vtu",
     "write_text",

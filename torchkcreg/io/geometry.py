@@ -1,15 +1,20 @@
-"""Projection geometry as JSON: one 3x4 matrix a view, the matrix being the truth about it."""
+"""Projection geometry in files: one 3x4 matrix a view, the matrix being the truth about it."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.io.files import read_json, write_json
+from torchkcreg.io.files import existing_file, read_json, write_json
+from torchkcreg.io.images import image_header
+from torchkcreg.io.matrix_tables import SUFFIXES, read_matrix_table, write_matrix_table
+from torchkcreg.io.rtk_geometry import read_rtk, write_rtk
 from torchkcreg.plain import finite_array, finite_number
 
 CONVENTION = "u = (P[0].X)/(P[2].X), v = (P[1].X)/(P[2].X); X=(x,y,z,1) in mm; u column, v row, 0-based pixel centres"
@@ -17,25 +22,58 @@ SOURCE_TOLERANCE_MM = 0.1
 SDD_TOLERANCE = 0.01
 
 
-def read_geometry(path: str | os.PathLike[str]) -> ConeBeamGeometry:
-    """The cone-beam geometry of a JSON file.
+def read_geometry(
+    path: str | os.PathLike[str],
+    *,
+    projections: str | os.PathLike[str] | None = None,
+    det_shape: Sequence[int] | None = None,
+    pixel_spacing: Sequence[float] | None = None,
+    layout: str | None = None,
+) -> ConeBeamGeometry:
+    """The cone-beam geometry of a file: JSON, RTK's XML, or a table of matrices.
 
-    Keys: `rows`, `cols`, `pixel_pitch_mm` (a number, or `[dv, du]`), `views`, a list of dicts with `projection_matrix`
-    (3x4, world mm to homogeneous 0-based pixels), and optionally `angle_deg` and `source` (a label) in every view.
-    What else a file says about itself is checked against the matrices: `source_mm` or `source_z_mm` of a view
-    within 0.1 mm, and where pixel pitch and matrices put the detector against `sdd_mm` within 1 %. Other keys are
+    JSON has the keys `rows`, `cols`, `pixel_pitch_mm` (a number, or `[dv, du]`), `views`, a list of dicts with
+    `projection_matrix` (3x4, world mm to homogeneous 0-based pixels), and optionally `angle_deg` and `source` (a label)
+    in every view. What else a file says about itself is checked against the matrices: `source_mm` or `source_z_mm` of a
+    view within 0.1 mm, and where pixel pitch and matrices put the detector against `sdd_mm` within 1 %. Other keys are
     ignored.
 
+    The other formats (`.xml`, see `read_rtk`; `.npy`, `.npz`, `.csv`, `.txt`, see `read_matrix_table`) do not say what
+    the pixels are: the header of the projections' image does, or the arguments.
+
     Args:
-        path: the file, as `write_geometry` writes it.
+        path: the file.
+        projections: the file of the projections, whose header has pixels and origin (MHA, NRRD, ...).
+        det_shape: (rows, cols), where neither file says them.
+        pixel_spacing: (dv, du) in mm, where neither file says them.
+        layout: of twelve numbers a view in a table.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is malformed, or contradicts itself; the message names the file, the view and the key.
+        ValueError: it is malformed, contradicts itself, or nothing says what the pixels are; the message names the
+            file, the view and the key.
     """
-    content = read_json(path, "geometry")
+    file = existing_file(path, "geometry")
+    suffix = file.suffix.lower()
+    if suffix != ".xml" and suffix not in SUFFIXES:
+        content = read_json(path, "geometry")
+        try:
+            return geometry_from_dict(content)
+        except ValueError as error:
+            raise ValueError(f"geometry file {path}: {error}") from error
+    header = None if projections is None else image_header(Path(projections))
+    shape = det_shape or (header.shape if header else None)
+    spacing = pixel_spacing or (header.pixel_spacing if header else None)
+    if shape is None or spacing is None:
+        raise ValueError(
+            f"geometry file {path} does not say what the pixels are: give the image of the projections, or rows, "
+            "columns and pixel spacing"
+        )
+    if suffix == ".xml":
+        origin = header.origin_mm if header is not None and pixel_spacing is None else None
+        return read_rtk(path, det_shape=shape, pixel_spacing=spacing, origin_mm=origin)
     try:
-        return geometry_from_dict(content)
+        return read_matrix_table(file, det_shape=shape, pixel_spacing=spacing, layout=layout)
     except ValueError as error:
         raise ValueError(f"geometry file {path}: {error}") from error
 
@@ -64,13 +102,20 @@ def geometry_from_dict(content: Any) -> ConeBeamGeometry:
     return geometry
 
 
-def write_geometry(path: str | os.PathLike[str], geometry: ConeBeamGeometry) -> None:
-    """Nothing; writes a geometry as JSON that `read_geometry` reads back to the same numbers.
+def write_geometry(path: str | os.PathLike[str], geometry: ConeBeamGeometry, *, layout: str = "matrices") -> None:
+    """Writes a geometry as `read_geometry` reads it back, to the same numbers: JSON, RTK's XML, or a table.
 
-    Besides what is needed, it says for people `source_mm` and `source_z_mm` of each view, and `sad_mm` (distance of
-    the source from the z axis) and `sdd_mm` where all the views agree on them.
+    Besides what is needed, JSON says for people `source_mm` and `source_z_mm` of each view, and `sad_mm` (distance of
+    the source from the z axis) and `sdd_mm` where all the views agree on them. Tables hold matrices, or ASTRA's vectors
+    where `layout` is "astra".
     """
-    write_json(path, geometry_to_dict(geometry))
+    suffix = Path(path).suffix.lower()
+    if suffix == ".xml":
+        write_rtk(path, geometry)
+    elif suffix in SUFFIXES:
+        write_matrix_table(Path(path), geometry, layout=layout)
+    else:
+        write_json(path, geometry_to_dict(geometry))
 
 
 def geometry_to_dict(geometry: ConeBeamGeometry) -> dict[str, Any]:

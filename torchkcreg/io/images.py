@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,38 @@ def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
 def num_slices(path: Path) -> int:
     """How many slices a volume has, by its header; raises as `read_slices`."""
     return (*_opened(path).GetSize(), 1)[2]
+
+
+@dataclass(frozen=True)
+class PixelHeader:
+    """Where the pixels of a stack of images are, by its header.
+
+    Attributes:
+        shape: (rows, cols).
+        pixel_spacing: (dv, du), mm; None for 1 x 1, which headers say that say nothing.
+        origin_mm: (u, v) of the centre of pixel (0, 0).
+    """
+
+    shape: tuple[int, int]
+    pixel_spacing: tuple[float, float] | None
+    origin_mm: tuple[float, float]
+
+
+def image_header(path: Path) -> PixelHeader | None:
+    """The header of a stack of images; None for what is no image, or has none.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    if path.suffix.lower() not in (".mha", ".mhd", ".nrrd", ".nhdr", ".nii"):
+        return None
+    try:
+        reader = _opened(path)
+    except RuntimeError as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        raise ValueError(f"projections file {path} cannot be read: {reason}") from error
+    (cols, rows), (du, dv), (u0, v0) = (x[:2] for x in (reader.GetSize(), reader.GetSpacing(), reader.GetOrigin()))
+    return PixelHeader((rows, cols), None if du == dv == 1.0 else (dv, du), (u0, v0))
 
 
 def read_image(path: Path) -> sitk.Image:

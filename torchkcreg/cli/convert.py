@@ -1,0 +1,43 @@
+"""``torchkcreg convert``: geometry from one format into another."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .command import add_command
+
+
+def add_convert(commands) -> None:
+    """Adds the command."""
+    text = "convert a geometry between JSON, RTK's XML, and tables of matrices or of ASTRA's vectors"
+    command = add_command(commands, "convert", _convert, text)
+    command.add_argument("source", type=Path, help="JSON, XML (RTK), NPY, NPZ, CSV or TXT")
+    command.add_argument("target", type=Path, help="the same kinds, by its ending")
+    command.add_argument("--projections", type=Path, help="image whose header says what the pixels are (MHA, NRRD)")
+    command.add_argument("--rows", type=int, help="of the detector, where no header says it")
+    command.add_argument("--cols", type=int, help="of the detector")
+    pitch = "between rows and between columns, one number or two"
+    command.add_argument("--pixel-pitch", type=float, nargs="+", metavar="MM", help=pitch)
+    layout = "of twelve numbers a view: matrices, or astra (source, detector, column step, row step in mm)"
+    command.add_argument("--layout", choices=("matrices", "astra"), help=layout)
+    axis = "the source's world has this axis for the gantry's (RTK: y); the target's has z"
+    command.add_argument("--gantry-axis", choices=("x", "y", "z"), default="z", help=axis)
+    command.add_argument("--overwrite", action="store_true", help="replace the target")
+
+
+def _convert(options: argparse.Namespace) -> None:
+    from torchkcreg.experiments import convert_geometry
+
+    print(
+        convert_geometry(
+            options.source,
+            options.target,
+            projections=options.projections,
+            det_shape=None if options.rows is None or options.cols is None else (options.rows, options.cols),
+            pixel_spacing=options.pixel_pitch,
+            layout=options.layout,
+            gantry_axis=options.gantry_axis,
+            overwrite=options.overwrite,
+        )
+    )
