@@ -17,7 +17,7 @@ from torchkcreg.geometry import (
     to_astra,
     to_leap,
 )
-from torchkcreg.io import read_geometry, read_rtk, write_geometry, write_rtk
+from torchkcreg.io import read_geometry, read_rtk, read_run, write_geometry, write_rtk
 
 SIZE = {"det_shape": (20, 31), "pixel_spacing": (0.8, 1.2)}
 GEOMETRY = circular_geometry(range(0, 360, 30), sad=404, sdd=538, det_offset_mm=(3, -2), source_z_mm=7.0, **SIZE)
@@ -178,3 +178,27 @@ def test_the_command_line_converts(tmp_path, capsys):
     assert "does not say what the pixels are" in capsys.readouterr().err
     assert main(["convert", target, str(tmp_path / "v.csv"), "--layout", "astra"]) == 0
     assert same(read_geometry(tmp_path / "v.csv", **SIZE, layout="astra"), GEOMETRY)
+
+
+def test_a_registration_from_rtks_geometry_and_a_stack_is_that_from_json(small_case, tmp_path):
+    """The same views, in RTK's XML and an MHA with a header: the same implant in the same place."""
+    geometry = read_geometry(small_case / "geometry.json")
+    with np.load(small_case / "projections.npz") as arrays:
+        intensity, open_beam = arrays["intensity"], float(np.mean(arrays["open_beam"]))
+    write_rtk(tmp_path / "geometry.xml", geometry)
+    image = sitk.GetImageFromArray(intensity)
+    (rows, cols), (dv, du) = geometry.det_shape, geometry.pixel_spacing
+    image.SetSpacing((du, dv, 1.0))
+    image.SetOrigin((-(cols - 1) / 2 * du, -(rows - 1) / 2 * dv, 0.0))
+    sitk.WriteImage(image, str(tmp_path / "stack.mha"))
+    common = ["--implant", str(small_case / "implant.stl"), "--config", str(small_case / "quick.yaml"), "--no-figures"]
+    files = {
+        "rtk": ["--geometry", tmp_path / "geometry.xml", "--projections", tmp_path / "stack.mha"],
+        "json": ["--geometry", small_case / "geometry.json", "--projections", small_case / "projections.npz"],
+    }
+    moved = {}
+    for name, own in files.items():
+        arguments = [*common, *map(str, own), "--open-beam", str(open_beam), "--out", str(tmp_path / name)]
+        assert main(["register", *arguments]) in (0, 3)
+        moved[name] = read_run(tmp_path / name).warp(torch.tensor([[0.0, 0.0, 30.0], [0.0, 0.0, -30.0]]))
+    assert torch.allclose(moved["rtk"], moved["json"], atol=0.01)

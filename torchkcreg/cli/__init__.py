@@ -20,6 +20,7 @@ from .experiment import add_experiment
 from .load import add_load
 from .plan import add_plan
 from .register import add_register
+from .report import add_report
 from .simulate import add_simulate
 from .study import add_study
 
@@ -59,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     add_load(commands)
     add_densitometry(commands)
     add_compare(commands)
+    add_report(commands)
     add_convert(commands)
     add_plan(commands)
     add_simulate(commands)

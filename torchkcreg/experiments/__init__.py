@@ -15,6 +15,7 @@ from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_
 from torchkcreg.experiments.reconstruction_options import ReconstructionFiles, ReconstructionOptions
 from torchkcreg.experiments.register_files import RegistrationFiles, register_files, resolve_config
 from torchkcreg.experiments.registered_components import registered_components
+from torchkcreg.experiments.report_files import write_report
 from torchkcreg.experiments.runs_compared import runs_compared
 from torchkcreg.experiments.seeds import SeedRuns, register_seeds
 from torchkcreg.experiments.simulate_files import SimulatedFiles, simulate_files
@@ -51,4 +52,5 @@ __all__ = [
     "resolve_options",
     "runs_compared",
     "simulate_files",
+    "write_report",
 ]

@@ -13,6 +13,7 @@ from .init import read_init, write_init
 from .matrix_tables import read_matrix_table, write_matrix_table
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
 from .plausible import implausible_magnification
+from .point_cloud_ply import read_point_cloud_ply
 from .points import read_points, write_points
 from .projection_file import ProjectionFile
 from .projections import Projections, read_projections, write_projections
@@ -41,6 +42,7 @@ __all__ = [
     "read_json",
     "read_matrix_table",
     "read_mesh",
+    "read_point_cloud_ply",
     "read_points",
     "read_projections",
     "read_reference",

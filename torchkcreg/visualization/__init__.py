@@ -12,11 +12,14 @@ from .errors import error_map_figure, histogram_figure
 from .history import history_figure
 from .load import load_figure
 from .overlay import overlay_figure
+from .page import Page, Row, page_html
 from .plan import plan_figure
 from .reconstruction import reconstruction_figure
 from .series import series_figure
 
 __all__ = [
+    "Page",
+    "Row",
     "beam_figure",
     "capture_figure",
     "case_figure",
@@ -27,6 +30,7 @@ __all__ = [
     "history_figure",
     "load_figure",
     "overlay_figure",
+    "page_html",
     "plan_figure",
     "reconstruction_figure",
     "series_figure",

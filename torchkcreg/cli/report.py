@@ -1,0 +1,22 @@
+"""``torchkcreg report``: a folder of results as one page."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .command import add_command
+
+
+def add_report(commands) -> None:
+    """Adds the command."""
+    text = "write a folder of results as one HTML page: verdict, numbers, pictures, the implant in 3D"
+    command = add_command(commands, "report", _report, text)
+    command.add_argument("folder", type=Path, help="of a registration, a comparison or a reconstruction")
+    command.add_argument("--out", type=Path, help="page to write (default: FOLDER/report.html)")
+
+
+def _report(options: argparse.Namespace) -> None:
+    from torchkcreg.experiments import write_report
+
+    print(write_report(options.folder, out=options.out))

@@ -1,0 +1,140 @@
+"""A report as one HTML page that needs nothing else: pictures, table, and a view of the implant in three dimensions."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+VERDICTS = ("ok", "doubtful", "failed")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A number of the table.
+
+    Attributes:
+        name: what it is.
+        value: with its unit.
+        deviation: expected error, with its unit; empty where there is none.
+        about: a sentence that says what it means; empty where the name does.
+    """
+
+    name: str
+    value: str
+    deviation: str = ""
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a report shows, in this order.
+
+    Attributes:
+        title: of the page.
+        verdict: "ok", "doubtful" or "failed"; None for what has no verdict.
+        summary: a sentence beside it.
+        warnings: what a user should know before trusting the numbers.
+        rows: the table.
+        scene: of the 3D view, see `implant_scene`; None for none.
+        pictures: title and PNG of each.
+        details: title and text of each, folded away.
+        made_with: a line about versions.
+    """
+
+    title: str
+    verdict: str | None = None
+    summary: str = ""
+    warnings: Sequence[str] = ()
+    rows: Sequence[Row] = ()
+    scene: dict[str, Any] | None = None
+    pictures: Sequence[tuple[str, bytes]] = ()
+    details: Sequence[tuple[str, str]] = ()
+    made_with: str = field(default="")
+
+
+def page_html(page: Page) -> str:
+    """The page as HTML: no other file, no network.
+
+    Raises:
+        ValueError: a verdict that there is not.
+
+    >>> "<h1>run &lt;1&gt;</h1>" in page_html(Page("run <1>", verdict="ok"))
+    True
+    """
+    if page.verdict is not None and page.verdict not in VERDICTS:
+        raise ValueError(f"verdict must be one of {', '.join(VERDICTS)}, got {page.verdict!r}")
+    parts = [f"<h1>{escape(page.title)}</h1>", _verdict(page), _table(page.rows), _viewer(page.scene)]
+    parts += [_pictures(page.pictures), *(_folded(title, text) for title, text in page.details)]
+    web = files("torchkcreg.visualization") / "web"
+    style, script = (web.joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "viewer.js"))
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+    return "\n".join(
+        [
+            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+            f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>{escape(page.title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>",
+            *(part for part in parts if part),
+            f"<footer>{escape(page.made_with)}</footer>\n</main>",
+            f"<script>\n{script}</script>\n</body>\n</html>\n",
+        ]
+    )
+
+
+def _verdict(page: Page) -> str:
+    if page.verdict is None and not page.warnings and not page.summary:
+        return ""
+    word = "" if page.verdict is None else f"<b>{escape(page.verdict)}</b> "
+    reasons = "".join(f"<li>{escape(text)}</li>" for text in page.warnings)
+    listed = f"<ul>{reasons}</ul>" if reasons else ""
+    return f'<div class="verdict {page.verdict or ""}">{word}{escape(page.summary)}{listed}</div>'
+
+
+def _table(rows: Sequence[Row]) -> str:
+    if not rows:
+        return ""
+    lines = [
+        f"<tr><td>{escape(row.name)}{f'<small>{escape(row.about)}</small>' if row.about else ''}</td>"
+        f'<td class="number">{escape(row.value)}</td><td class="number">{escape(row.deviation)}</td></tr>'
+        for row in rows
+    ]
+    head = '<tr><th></th><th class="number">value</th><th class="number">expected error</th></tr>'
+    return f'<section><h2>Numbers</h2><div class="wide"><table>{head}{"".join(lines)}</table></div></section>'
+
+
+def _viewer(scene: dict[str, Any] | None) -> str:
+    if scene is None:
+        return ""
+    content = json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c")
+    views = '<label><input type="checkbox" name="views"> focal spots and detectors</label>' if scene["sources"] else ""
+    return (
+        '<section class="viewer"><h2>The implant in its place</h2>'
+        f'<script type="application/json">{content}</script>'
+        '<canvas role="img" aria-label="The registered implant, coloured by its displacement; drag to turn"></canvas>'
+        '<div class="controls"><label>displacement <input type="range" name="times" min="0" max="20" value="1">'
+        "<output>1 x</output></label>"
+        '<label>colour <select name="value"><option value="displacement">displacement</option>'
+        f'<option value="std">expected error</option></select></label>{views}</div>'
+        "<p>Drag to turn, wheel or two fingers to zoom. 0 x is the undeformed implant, 1 x what was measured.</p>"
+        "</section>"
+    )
+
+
+def _pictures(pictures: Sequence[tuple[str, bytes]]) -> str:
+    if not pictures:
+        return ""
+    shown = "".join(
+        f'<figure><img alt="{escape(title)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+        f"<figcaption>{escape(title)}</figcaption></figure>"
+        for title, png in pictures
+    )
+    return f"<section><h2>Pictures</h2>{shown}</section>"
+
+
+def _folded(title: str, text: str) -> str:
+    return f"<section><details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details></section>"
