@@ -70,7 +70,7 @@ def test_every_flag_in_the_readme_exists(capsys):
     from torchkcreg.cli import main
 
     texts = []
-    made = ("simulate", "experiment", "study", "demo", "densitometry", "convert", "report")
+    made = ("simulate", "experiment", "study", "demo", "densitometry", "convert", "report", "doctor")
     for command in ("register", "warp", "evaluate", "load", "compare", "plan", "reconstruct", "info", *made):
         assert main([command, "--help"]) == 0
         texts.append(capsys.readouterr().out)

@@ -16,6 +16,7 @@ from .command import add_command
 from .compare import add_compare
 from .convert import add_convert
 from .densitometry import add_densitometry
+from .doctor import add_doctor
 from .experiment import add_experiment
 from .load import add_load
 from .plan import add_plan
@@ -68,6 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     add_study(commands)
     _add_reconstruct(commands)
     _add_info(commands)
+    add_doctor(commands)
     _add_demo(commands)
     return parser
 

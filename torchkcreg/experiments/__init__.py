@@ -6,6 +6,7 @@ from torchkcreg.experiments.convert_files import convert_geometry
 from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.densitometry_files import densitometry_files
 from torchkcreg.experiments.describe import describe, describe_installation
+from torchkcreg.experiments.doctor import doctor, self_test
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
 from torchkcreg.experiments.implant_of_run import implant_of_run
@@ -39,6 +40,7 @@ __all__ = [
     "densitometry_files",
     "describe",
     "describe_installation",
+    "doctor",
     "draw_registration",
     "evaluate_files",
     "implant_of_run",
@@ -51,6 +53,7 @@ __all__ = [
     "resolve_config",
     "resolve_options",
     "runs_compared",
+    "self_test",
     "simulate_files",
     "write_report",
 ]
