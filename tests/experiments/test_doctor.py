@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from torchkcreg.cli import main
-from torchkcreg.experiments import doctor as module_function
-from torchkcreg.experiments import self_test
+from torchkcreg.experiments import doctor, self_test
 
 
 def test_the_installation_works(capsys):
@@ -19,7 +18,7 @@ def test_the_installation_works(capsys):
 
 
 def test_a_projector_that_is_wrong_and_one_that_raises_are_told(monkeypatch):
-    import torchkcreg.experiments.doctor as where
+    import torchkcreg.experiments.installation_check as where
 
     def broken(*arguments, backend="auto", **options):
         return torch.ones(3, 24, 32) * (1.01 if backend == "auto" else 1.0)
@@ -33,5 +32,5 @@ def test_a_projector_that_is_wrong_and_one_that_raises_are_told(monkeypatch):
     found = {check.name: check for check in self_test()}
     assert not found["projector of nodes"].passed and "1.0e-02 from the reference" in found["projector of nodes"].found
     assert str(found["projector of voxels"]) == "FAIL projector of voxels: OSError: no such library"
-    text, healthy = module_function()
+    text, healthy = doctor()
     assert not healthy and text.endswith("see FAIL above")

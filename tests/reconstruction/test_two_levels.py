@@ -4,6 +4,7 @@ import pytest
 import torch
 import trimesh
 
+from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import TwoLevelGrid, VolumeGrid, circular_geometry
 from torchkcreg.reconstruction import (
     BeamModel,
@@ -128,3 +129,20 @@ def test_known_metal_on_two_levels_leaves_water_alone():
     one = reconstruct(torch.exp(-line_integrals), GEOMETRY, COARSE, beam, **options).volume
     away = ~grid.divided
     assert (coarse - one)[away].abs().mean() < 0.001
+
+
+def test_a_stopped_run_on_two_levels_goes_on_to_the_same_volume():
+    system = VoxelSystem(GEOMETRY, COARSE)
+    transmission = torch.exp(-system.project(0.02 * (COARSE.points()[..., :2].norm(dim=-1) < 7), VIEWS))
+    kept = {}
+
+    class Keeps(Callback):
+        def on_iteration(self, run, index, progress):
+            if index == 1 and progress["iteration"] == 2:
+                kept.update({"pass": index, "solver": run.state_dict(), "volume": run.initial.clone()})
+
+    options = {"config": PWLSConfig(iterations=4, subsets=3), "passes": 2}
+    beam, grid = BeamModel.monoenergetic([]), two_levels()
+    whole = reconstruct(transmission, GEOMETRY, grid, beam, callbacks=[Keeps()], **options)
+    resumed = reconstruct(transmission, GEOMETRY, grid, beam, state=kept, **options)
+    assert torch.equal(whole.volume, resumed.volume)

@@ -6,10 +6,10 @@ from torchkcreg.experiments.convert_files import convert_geometry
 from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.densitometry_files import densitometry_files
 from torchkcreg.experiments.describe import describe, describe_installation
-from torchkcreg.experiments.doctor import doctor, self_test
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
 from torchkcreg.experiments.implant_of_run import implant_of_run
+from torchkcreg.experiments.installation_check import doctor, self_test
 from torchkcreg.experiments.load_files import ImplantLoad, load_files
 from torchkcreg.experiments.plan_files import ViewPlan, plan_files
 from torchkcreg.experiments.reconstruct_files import reconstruct_files, resolve_options

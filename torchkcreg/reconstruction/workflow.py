@@ -203,7 +203,7 @@ def _solver(
         rough = VoxelRoughness(grid.spacing)
         return PWLS(system, *inputs, mask=unknown, initial=initial, roughness=rough, shard=shard)
     mask = (unknown_share(components, grid) if components else grid.active).to(data.weights)
-    return PWLS(
+    solver = PWLS(
         TwoLevelSystem(system.geometry, grid, backend=system.backend),
         *inputs,
         mask=mask,
@@ -211,3 +211,5 @@ def _solver(
         roughness=TwoLevelRoughness(grid),
         shard=shard,
     )
+    solver.initial = initial  # the coarse volume, from which a resumed run prepares its data anew
+    return solver
