@@ -40,6 +40,8 @@ def add_register(commands) -> None:
     command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
     command.add_argument("--backend", help="projector: auto, cpp, triton or torch")
     command.add_argument("--device", help="where it is computed: cpu (default), cuda, cuda:1, ...")
+    dry = "read and check everything, say and draw where the implant lies at the start (OUT-start.png), and stop"
+    command.add_argument("--dry-run", action="store_true", help=dry)
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
     existing = command.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
@@ -63,7 +65,7 @@ def _integers(text: str) -> list[int]:
 
 
 def _register(options: argparse.Namespace) -> int:
-    from torchkcreg.experiments import RegistrationFiles, register_files, register_seeds
+    from torchkcreg.experiments import RegistrationFiles, dry_run, register_files, register_seeds
 
     if options.seeds is not None and options.resume:
         raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")
@@ -74,6 +76,10 @@ def _register(options: argparse.Namespace) -> int:
     names = ("preset", "deformation", "pitch_mm", "seed", "backend", "device")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     overrides |= {"material": options.material[0]} if options.material else {}
+    if options.dry_run:
+        picture = None if options.no_figures else options.out.with_name(f"{options.out.name}-start.png")
+        print("\n".join(dry_run(files, picture, overrides=overrides)))
+        return 0
     how = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}
     if options.seeds is not None:
         runs = register_seeds(files, options.out, options.seeds, **how)

@@ -6,6 +6,7 @@ from torchkcreg.experiments.convert_files import convert_geometry
 from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.densitometry_files import densitometry_files
 from torchkcreg.experiments.describe import describe, describe_installation
+from torchkcreg.experiments.dry_run import dry_run
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
 from torchkcreg.experiments.implant_of_run import implant_of_run
@@ -42,6 +43,7 @@ __all__ = [
     "describe_installation",
     "doctor",
     "draw_registration",
+    "dry_run",
     "evaluate_files",
     "implant_of_run",
     "load_files",

@@ -28,6 +28,7 @@ def overlay_figure(
     pixel_spacing: tuple[float, float] | None = None,
     margin_px: int = 20,
     crop: bool = True,
+    label: str = "after",
 ) -> Figure:
     """A figure of projections in grey with the implant's DRR in green, a column a view, before (if given) over after.
 
@@ -45,11 +46,12 @@ def overlay_figure(
         pixel_spacing: (dv, du) in mm, for a scale bar at the detector and square millimetres.
         margin_px: pixels kept around the implant.
         crop: show only the implant's surroundings, the same size in each view.
+        label: of the row of `after`.
 
     Raises:
         ValueError: shapes differ.
     """
-    given = {"measured": measured, "before": before, "after": after}
+    given = {"measured": measured, "before": before, label: after}
     for name, tensor in given.items():
         if tensor is not None and (tensor.ndim != 3 or tensor.shape != after.shape):
             raise ValueError(
@@ -57,7 +59,7 @@ def overlay_figure(
             )
     arrays = {name: tensor.detach().cpu().double().numpy() for name, tensor in given.items() if tensor is not None}
     images = arrays.pop("measured")
-    gc = {"before": gc_before, "after": gc_after}
+    gc = {"before": gc_before, label: gc_after}
     windows = _windows(list(arrays.values()), margin_px) if crop else [(slice(None), slice(None))] * len(images)
     dv, du = pixel_spacing or (1.0, 1.0)
 
