@@ -9,10 +9,15 @@ from dataclasses import dataclass
 
 import torch
 
+from torchkcreg.evaluation import bb_rmse
 from torchkcreg.geometry import VolumeGrid, circular_geometry
+from torchkcreg.implant import Component, ImplantPointCloud
 from torchkcreg.kernels import PACKAGE, choose_backend, unavailable_reason
+from torchkcreg.physics import line_integrals_from_intensity
 from torchkcreg.projector import backproject, project_points, project_volume
 from torchkcreg.reconstruction import fdk
+from torchkcreg.registration import RegistrationConfig, register
+from torchkcreg.scene import RegistrationData
 from torchkcreg.simulation import weight_bearing_case
 
 from .describe import describe_installation
@@ -122,16 +127,6 @@ def _fdk() -> tuple[bool, str]:
 
 
 def _registration() -> tuple[bool, str]:
-    from torchkcreg import (
-        Component,
-        ImplantPointCloud,
-        RegistrationConfig,
-        RegistrationData,
-        line_integrals_from_intensity,
-        register,
-    )
-    from torchkcreg.evaluation import bb_rmse
-
     start = time.perf_counter()
     case = weight_bearing_case(0.5, binning=4)
     data = RegistrationData(case.geometry, *line_integrals_from_intensity(case.intensity.float(), case.open_beam))
