@@ -132,7 +132,14 @@ def test_tables_that_hold_something_else_are_refused(tmp_path):
     np.save(tmp_path / "b.npy", np.array([{"a": 1}]), allow_pickle=True)
     (tmp_path / "c.csv").write_text("1,2,3,x\n")
     np.savez(tmp_path / "d.npz", a=np.ones(3), b=np.ones(3))
-    reasons = {"a.npy": "got an array of shape", "b.npy": "Object arrays", "c.csv": "c.csv", "d.npz": "one array"}
+    np.savez_compressed(tmp_path / "e.npz", np.zeros((1 << 24,)))  # packs to a hundredth
+    reasons = {
+        "e.npz": "unpacks to",
+        "a.npy": "got an array of shape",
+        "b.npy": "Python objects",
+        "c.csv": "c.csv",
+        "d.npz": "one array",
+    }
     for name, reason in reasons.items():
         with pytest.raises(ValueError, match=reason):
             read_geometry(tmp_path / name, **SIZE)

@@ -25,6 +25,7 @@ from torchkcreg.io import (
     read_geometry,
     read_init,
     read_mesh,
+    read_point_cloud_ply,
     read_points,
     read_projections,
     read_reference,
@@ -34,6 +35,7 @@ from torchkcreg.io import (
     write_geometry,
     write_init,
     write_mesh,
+    write_point_cloud_ply,
     write_points,
     write_projections,
     write_spectrum,
@@ -41,6 +43,8 @@ from torchkcreg.io import (
 )
 from torchkcreg.physics import tungsten_spectrum
 
+VIEWS = MultisourceScanner().geometry().select([0, 1])
+PIXELS: dict[str, Any] = {"det_shape": VIEWS.det_shape, "pixel_spacing": VIEWS.pixel_spacing}
 BOX = trimesh.creation.box((12.0, 4.0, 90.0))
 _TOKENS = [
     b"",
@@ -84,6 +88,11 @@ def _points(path: Path) -> None:
 Reader = tuple[str, Callable[[Path], Any], Callable[[Path], Any]]
 READERS: dict[str, Reader] = {
     "geometry": ("g.json", lambda p: write_geometry(p, MultisourceScanner().geometry().select([0, 1])), read_geometry),
+    "rtk": ("g.xml", lambda p: write_geometry(p, VIEWS), lambda p: read_geometry(p, **PIXELS)),
+    "matrices, npy": ("g.npy", lambda p: write_geometry(p, VIEWS), lambda p: read_geometry(p, **PIXELS)),
+    "matrices, npz": ("g.npz", lambda p: write_geometry(p, VIEWS), lambda p: read_geometry(p, **PIXELS)),
+    "matrices, csv": ("g.csv", lambda p: write_geometry(p, VIEWS), lambda p: read_geometry(p, **PIXELS)),
+    "point cloud": ("p.ply", lambda p: write_point_cloud_ply(p, torch.rand(6, 3)), read_point_cloud_ply),
     "points": ("p.csv", _points, read_points),
     "spectrum": ("s.csv", lambda p: write_spectrum(p, tungsten_spectrum(70)), read_spectrum),
     "components": (

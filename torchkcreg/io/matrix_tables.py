@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -79,17 +80,20 @@ def write_matrix_table(path: Path, geometry: ConeBeamGeometry, *, layout: str = 
 
 def _table(path: Path) -> NDArray:
     suffix = path.suffix.lower()
+    if suffix in (".csv", ".txt"):
+        return np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2)
     try:
-        if suffix in (".csv", ".txt"):
-            return np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2)
-        content = np.load(path, allow_pickle=False)
         if suffix == ".npy":
-            return content
-        with content as arrays:
+            return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))  # mapped: no more than the file holds
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > LARGEST:
+            raise ValueError(f"unpacks to {unpacked} bytes, more than {LARGEST}")
+        with np.load(path, allow_pickle=False) as arrays:
             names = arrays.files
             if "projection_matrices" not in names and len(names) != 1:
                 raise ValueError(f"must hold one array, or name it projection_matrices, got {', '.join(names)}")
             return arrays["projection_matrices" if "projection_matrices" in names else names[0]]
-    except (OSError, EOFError, KeyError, RuntimeError) as error:
+    except Exception as error:  # NumPy and zip archives fail in many ways, and each means a damaged file
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ValueError(f"cannot be read: {reason[:120]}") from error
