@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -113,6 +115,14 @@ def test_known_components_are_reconstructed_from_views_as_they_are_read(scan, tm
         reconstruct(read, geometry, GRID, beam, mask=mask, **options)
     with pytest.raises(ValueError, match="transmission must have shape"):
         reconstruct(transmission[:4], geometry, GRID, beam, **options)
+
+
+def test_a_disk_without_room_is_told_before_anything_is_written(scan, tmp_path, monkeypatch):
+    geometry, images = scan
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
+    with pytest.raises(OSError, match=r"has room for 0\.0 GiB"):
+        reconstruct(torch.exp(-images), geometry, GRID, BeamModel.monoenergetic([]), folder=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_streams(scan, tmp_path, capsys):

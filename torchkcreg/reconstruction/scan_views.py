@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import os
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -48,13 +51,18 @@ class Workspace:
         self.folder = folder
 
     def empty(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """An array of a shape, of another's type, to be filled."""
+        """An array of a shape, of another's type, to be filled.
+
+        Raises:
+            OSError: the folder's disk has no room for it.
+        """
         if self.folder is None:
             return like.new_empty(tuple(shape))
-        size = 1
-        for count in shape:
-            size *= int(count)
-        path = self.folder / f"array-{id(self)}-{size}"
+        size = math.prod(int(count) for count in shape)
+        needed, free = size * like.element_size(), shutil.disk_usage(self.folder).free
+        if needed > free:  # a mapped file that outgrows its disk would end the process
+            raise OSError(f"{self.folder} has room for {free / 2**30:.1f} GiB, {needed / 2**30:.1f} GiB are needed")
+        path = self.folder / f"array-{os.getpid()}-{size}"
         array = torch.from_file(str(path), shared=True, size=size, dtype=like.dtype, device="cpu")
         path.unlink()
         return array.view(tuple(shape))
