@@ -1,5 +1,7 @@
 """How good a registration is, and what it measured: errors at reference points and of the shape, displacement maps."""
 
+from torchkcreg.geometry import distance_to
+
 from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
 from .bead_shadows import bead_shadows, track_beads
 from .beads import Beads, find_beads
@@ -8,7 +10,7 @@ from .displacement import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
 from .fragments import Fragments, fragments_of
 from .points import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
-from .regions import RegionStatistics, cylinder_region, distance_to, region_statistics
+from .regions import RegionStatistics, cylinder_region, region_statistics
 from .relative_motion import AXES, RelativeMotion, relative_motion
 from .shape import ShapeEvaluation, evaluate_shape
 from .statistics import DistanceStatistics, distance_statistics, full_width_at_half_maximum

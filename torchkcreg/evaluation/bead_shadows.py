@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -116,6 +117,16 @@ def _distinct(tracks: Tensor, diameter_px: float) -> Tensor:
 
 def _correlation(image: Tensor, radius: float) -> Tensor:
     """Correlation of an image's surroundings of each pixel with a ball's shadow, a plane taken away, (rows, cols)."""
+    kernels, inside = _kernels(radius)
+    padded = pad(image[None, None], [kernels.shape[-1] // 2] * 4, mode="replicate")
+    along, *planes = conv2d(padded, kernels)[0]
+    power = conv2d(padded.square(), inside)[0, 0] - sum(part.square() for part in planes)
+    return along / power.clamp_min(1e-12).sqrt()
+
+
+@lru_cache(maxsize=4)
+def _kernels(radius: float) -> tuple[Tensor, Tensor]:
+    """A ball's shadow and the three parts of a plane, (4, 1, n, n), orthonormal; where they count, (1, 1, n, n)."""
     reach = math.ceil(AROUND * radius)
     steps = torch.arange(-reach, reach + 1, dtype=torch.float64)
     down, across = torch.meshgrid(steps, steps, indexing="ij")
@@ -133,10 +144,7 @@ def _correlation(image: Tensor, radius: float) -> Tensor:
     kernels[0, 0][inside] = shape / shape.norm()
     for k in range(3):
         kernels[k + 1, 0][inside] = plane[k]
-    padded = pad(image[None, None], [reach] * 4, mode="replicate")
-    along, *planes = conv2d(padded, kernels)[0]
-    power = conv2d(padded.square(), inside[None, None].double())[0, 0] - sum(part.square() for part in planes)
-    return along / power.clamp_min(1e-12).sqrt()
+    return kernels, inside[None, None].double()
 
 
 def _peak(map_: Tensor, u: float, v: float, search: float) -> tuple[Tensor, float]:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid
@@ -45,19 +44,6 @@ def cylinder_region(grid: VolumeGrid, start: Sequence[float], end: Sequence[floa
     along = ((points - first) @ axis) / (axis @ axis)
     distance = (points - first - along[..., None] * axis).norm(dim=-1)
     return (along >= 0) & (along <= 1) & (distance <= radius)
-
-
-def distance_to(filled: Tensor, grid: VolumeGrid) -> Tensor:
-    """Distances (D, H, W) in mm of voxel centres from the nearest voxel that is filled; infinite where none is.
-
-    Args:
-        filled: (D, H, W), true or above zero where the thing is.
-        grid: the voxels.
-    """
-    if not bool((filled > 0).any()):
-        return torch.full(grid.shape, torch.inf)
-    distances = distance_transform_edt((filled <= 0).cpu().numpy(), sampling=tuple(reversed(grid.spacing)))
-    return torch.from_numpy(distances).float()
 
 
 def region_statistics(volume: Tensor, region: Tensor, *, reference: Tensor | None = None) -> RegionStatistics:

@@ -22,13 +22,17 @@ _IMAGES = (".npz", ".npy", ".mha", ".mhd", ".nrrd", ".nii", ".gz", ".tif", ".tif
 def describe_installation() -> str:
     """Versions, threads and the projector's backend with the reason for it, a line each."""
     lines = [f"{name} {version}" for name, version in versions().items()]
-    backend = choose_backend(torch.empty(0), "auto").name
-    if backend == "cpp":
-        built = any(PACKAGE.glob("_C*.so")) or any(PACKAGE.glob("_C*.pyd"))
-        why = "C++ kernels built with the package" if built else "C++ kernels compiled at first use"
-    else:
-        why = f"the readable reference, slow; no C++ kernels: {unavailable_reason()}"
+    backend, why = kernels_in_words()
     return "\n".join([*lines, f"projector backend {backend} ({why})"])
+
+
+def kernels_in_words() -> tuple[str, str]:
+    """The projector's backend on a CPU, and why it is this one."""
+    backend = choose_backend(torch.empty(0), "auto").name
+    if backend != "cpp":
+        return backend, f"the readable reference, slow; no C++ kernels: {unavailable_reason()}"
+    built = any(PACKAGE.glob("_C*.so")) or any(PACKAGE.glob("_C*.pyd"))
+    return backend, "C++ kernels built with the package" if built else "C++ kernels compiled at first use"
 
 
 def describe(path: Path, *, open_beam: float | None = None) -> str:

@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.io import write_figure
-from torchkcreg.scene import Scene
-from torchkcreg.visualization import overlay_figure
 
-from .figures import MOST_VIEWS
+from .figures import draw_start
 from .inputs import RegistrationFiles, read_inputs
 from .register_files import prepared_trainer, resolve_config
 
@@ -43,7 +40,7 @@ def dry_run(files: RegistrationFiles, picture: Path | None, *, overrides: dict[s
         lines += [f"  {line}" for line in _in_views(nodes, data.geometry.cpu())]
     lines.append(f"{len(trainer.stages)} stages; nothing was registered")
     if picture is not None:
-        write_figure(picture, _picture(scene, data.geometry, data.line_integrals))
+        write_figure(picture, draw_start(scene.cpu(), data.to("cpu")))
         lines.append(f"picture {picture}")
     return lines
 
@@ -64,14 +61,3 @@ def _in_views(nodes: Tensor, geometry: ConeBeamGeometry) -> list[str]:
             f"{100 * float(inside[view]):.0f} % within the image, magnified {float(magnified[view]):.2f} times"
         )
     return lines
-
-
-@torch.no_grad()
-def _picture(scene: Scene, geometry: ConeBeamGeometry, measured: Tensor):
-    views = sorted({round(i * (len(measured) - 1) / (MOST_VIEWS - 1)) for i in range(MOST_VIEWS)})
-    shown = geometry.select(views)
-    labels = [f"view {v}" if shown.angles_deg is None else f"{shown.angles_deg[i]:g} deg" for i, v in enumerate(views)]
-    drawn = scene(shown).cpu()
-    return overlay_figure(
-        measured[views].cpu(), drawn, view_labels=labels, pixel_spacing=shown.pixel_spacing, label="start"
-    )

@@ -78,8 +78,25 @@ def _as_told(scene: Scene) -> Scene:
     return bare
 
 
+def draw_start(scene: Scene, data: RegistrationData) -> Figure:
+    """The figure of a scene as it stands over the views; of more than six, six are drawn."""
+    views = _drawn_views(data)
+    shown = data.select(views)
+    return overlay_figure(
+        shown.line_integrals,
+        _drr(scene, shown),
+        view_labels=_labels(shown.geometry, views),
+        pixel_spacing=shown.geometry.pixel_spacing,
+        label="start",
+    )
+
+
+def _drawn_views(data: RegistrationData) -> list[int]:
+    return torch.linspace(0, data.num_views - 1, min(data.num_views, MOST_VIEWS)).round().long().tolist()
+
+
 def _overlay(result: RegistrationResult, scene: Scene, data: RegistrationData, starts: Sequence[Tensor]) -> Figure:
-    views = torch.linspace(0, data.num_views - 1, min(data.num_views, MOST_VIEWS)).round().long().tolist()
+    views = _drawn_views(data)
     shown = data.select(views)
     start = start_scene(scene, starts)
     return overlay_figure(

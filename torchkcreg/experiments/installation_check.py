@@ -12,7 +12,6 @@ import torch
 from torchkcreg.evaluation import bb_rmse
 from torchkcreg.geometry import VolumeGrid, circular_geometry
 from torchkcreg.implant import Component, ImplantPointCloud
-from torchkcreg.kernels import PACKAGE, choose_backend, unavailable_reason
 from torchkcreg.physics import line_integrals_from_intensity
 from torchkcreg.projector import backproject, project_points, project_volume
 from torchkcreg.reconstruction import fdk
@@ -20,7 +19,7 @@ from torchkcreg.registration import RegistrationConfig, register
 from torchkcreg.scene import RegistrationData
 from torchkcreg.simulation import weight_bearing_case
 
-from .describe import describe_installation
+from .describe import describe_installation, kernels_in_words
 
 GEOMETRY = circular_geometry(range(0, 360, 12), sad=404, sdd=538, det_shape=(24, 32), pixel_spacing=(3.0, 3.0))
 ROUNDING = 1e-4  # of the largest value: single precision, and a margin
@@ -74,10 +73,8 @@ def doctor() -> tuple[str, bool]:
 
 
 def _kernels() -> tuple[bool, str]:
-    if choose_backend(torch.empty(0), "auto").name == "cpp":
-        built = any(PACKAGE.glob("_C*.so")) or any(PACKAGE.glob("_C*.pyd"))
-        return True, "C++, built with the package" if built else "C++, compiled at first use"
-    return False, f"no C++ kernels, everything is many times slower: {unavailable_reason()}"
+    backend, why = kernels_in_words()
+    return backend == "cpp", why
 
 
 def _threads() -> tuple[bool, str]:

@@ -19,7 +19,6 @@ from torchkcreg.reconstruction import (
     PWLS,
     FDKConfig,
     PWLSConfig,
-    Veil,
     ViewShard,
     fdk,
     hounsfield,
@@ -179,21 +178,13 @@ def _metrics(
         "largest": float(volume.max()),
         "reference_kev": beam.reference_kev,
         "water": beam.water,
-        "scatter": _scatter_in_words(inputs.scatter),
+        "scatter": inputs.scatter_in_words(),
         "beam": None if inputs.estimate is None else inputs.estimate.in_words(),
         "components": [component.material for component in inputs.components],
         "passes": None if options.is_filtered else options.num_passes,
         "history": history,
         "seconds": seconds,
     }
-
-
-def _scatter_in_words(scatter: Veil | Tensor | None) -> dict[str, Any] | None:
-    if scatter is None:
-        return None
-    if isinstance(scatter, Veil):
-        return {"fraction": scatter.fraction, "sigma_mm": scatter.sigma_mm}
-    return {"mean_of_run": float(scatter.mean())}
 
 
 def _write(
@@ -204,7 +195,7 @@ def _write(
     metrics: dict[str, Any],
     figures: bool,
 ) -> None:
-    beam, shares = inputs.beam, options.single_material is not None
+    beam, shares, whole = inputs.beam, options.single_material is not None, None
     for prefix, (volume, grid) in zip(("", "near_metal_"), levels, strict=False):
         write_volume(run.path / f"{prefix}volume.mha", volume, grid)
         if not shares:
@@ -218,7 +209,7 @@ def _write(
             curve = beam_figure(found.beam.beam, found.alloys, found.lengths_mm, found.measured)
             run.write_figure("beam.png", curve)
         window = (0.0, 1.2 if shares else 2 * beam.water)
-        run.write_figure("slices.png", _slices(inputs, *levels[-1], window))
+        run.write_figure("slices.png", _slices(inputs, *levels[-1], whole, window))
     run.write_metrics(metrics)
 
 
@@ -231,12 +222,15 @@ def _with_implant(inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid
     return with_components(volume, inputs.components, grid, values)
 
 
-def _slices(inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid, window: tuple[float, float]) -> Figure:
+def _slices(
+    inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid, whole: Tensor | None, window: tuple[float, float]
+) -> Figure:
+    """Three heights of a volume, and of the same with the implant in it, where there is one."""
     middle, reach = grid.origin[2] + grid.size_mm[2] / 2, grid.size_mm[2] / 4
     heights = (middle - reach, middle, middle + reach) if grid.shape[0] > 3 else (middle,)
     shown, metal = {"reconstruction": volume}, None
-    if inputs.components:
-        shown = {"background": volume, "with the implant": _with_implant(inputs, volume, grid)}
+    if whole is not None:
+        shown = {"background": volume, "with the implant": whole}
         metal = sum((component.fraction(grid) for component in inputs.components), torch.zeros(grid.shape))
     return reconstruction_figure(shown, grid, heights_mm=heights, window=window, metal=metal)
 

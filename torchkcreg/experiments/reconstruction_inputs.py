@@ -71,6 +71,14 @@ class ReconstructionInputs:
         transmission = torch.exp(-filled(part.line_integrals, part.mask))
         return replace(self, geometry=self.geometry.select(views), transmission=transmission, mask=part.mask, file=None)
 
+    def scatter_in_words(self) -> dict[str, float] | None:
+        """The scatter's figures, as metrics have them."""
+        if self.scatter is None:
+            return None
+        if isinstance(self.scatter, Veil):
+            return {"fraction": self.scatter.fraction, "sigma_mm": self.scatter.sigma_mm}
+        return {"mean_of_run": float(self.scatter.mean())}
+
     def read(self, views: list[int]) -> tuple[Tensor, Tensor]:
         """Transmission and mask (v, rows, cols) of some views, read from the file."""
         part = self.of_views(views)

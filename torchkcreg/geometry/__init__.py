@@ -7,6 +7,7 @@ else about it (source, rays, pixel positions) is derived from that.
 from torchkcreg.geometry.calibration import Calibration, calibrate
 from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
+from torchkcreg.geometry.distance import distance_to
 from torchkcreg.geometry.frames import DetectorFrames, from_astra, from_leap, gantry_about_z, to_astra, to_leap
 from torchkcreg.geometry.multisource import MultisourceScanner
 from torchkcreg.geometry.principal import principal_axes
@@ -33,6 +34,7 @@ __all__ = [
     "across",
     "calibrate",
     "circular_geometry",
+    "distance_to",
     "fit_rigid",
     "from_astra",
     "from_leap",

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torchkcreg.geometry.circular import matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
 from torchkcreg.geometry.frames import DetectorFrames
 from torchkcreg.geometry.se3 import rotation_from_vector
@@ -117,16 +116,10 @@ class _Fit:
         """The geometry with the detector in its place."""
         geometry, move = self.geometry, torch.from_numpy(x[:6])
         turn = rotation_from_vector(self.frames @ move[3:].deg2rad())
-        matrices = matrices_from_frames(
-            self.sources,
-            self.centers + self.frames @ move[:3],
-            (turn @ self.frames[:, :, :1])[..., 0],
-            (turn @ self.frames[:, :, 1:2])[..., 0],
-            det_shape=geometry.det_shape,
-            pixel_spacing=geometry.pixel_spacing,
-        )
-        size = geometry.det_shape, geometry.pixel_spacing
-        return ConeBeamGeometry(matrices, *size, sources=geometry.sources, angles_deg=geometry.angles_deg)
+        dv, du = geometry.pixel_spacing
+        across, down, _ = (turn @ self.frames).unbind(-1)
+        moved = DetectorFrames(self.sources, self.centers + self.frames @ move[:3], du * across, dv * down)
+        return moved.geometry(geometry.det_shape, sources=geometry.sources, angles_deg=geometry.angles_deg)
 
     def residuals(self, x: NDArray) -> NDArray:
         """Measured less modelled, pixels, of what was seen, (n, 2)."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, interpolate
 
+from .distance import distance_to
 from .volume_grid import VolumeGrid
 
 
@@ -74,8 +74,7 @@ class TwoLevelGrid:
             raise ValueError(f"within_mm must be positive, got {within_mm}")
         if tuple(filled.shape) != coarse.shape or not bool((filled > 0).any()):
             raise ValueError("nothing within the grid is filled: there is nothing to divide voxels around")
-        distances = distance_transform_edt((filled <= 0).cpu().numpy(), sampling=tuple(reversed(coarse.spacing)))
-        return cls(coarse, torch.from_numpy(distances <= within_mm), factor)
+        return cls(coarse, distance_to(filled, coarse) <= within_mm, factor)
 
     def _fine(self) -> VolumeGrid:
         n, grid = self.factor, self.coarse

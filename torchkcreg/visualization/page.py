@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from typing import Any
@@ -54,7 +54,7 @@ class Page:
     scene: dict[str, Any] | None = None
     pictures: Sequence[tuple[str, bytes]] = ()
     details: Sequence[tuple[str, str]] = ()
-    made_with: str = field(default="")
+    made_with: str = ""
 
 
 def page_html(page: Page) -> str:
