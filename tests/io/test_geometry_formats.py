@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -13,6 +15,8 @@ from torchkcreg.geometry import (
     circular_geometry,
     from_astra,
     from_leap,
+    from_leap_cone,
+    from_tigre,
     gantry_about_z,
     to_astra,
     to_leap,
@@ -155,6 +159,38 @@ def test_leaps_and_astras_vectors_are_the_same_views():
         from_astra(torch.ones(3, 11), (4, 4))
     with pytest.raises(ValueError, match="one size in all views"):
         from_astra(to_astra(GEOMETRY) * torch.linspace(1, 2, 12)[:, None], (20, 31))
+
+
+def test_parameters_of_leap_and_tigre_are_the_same_views():
+    angles = torch.arange(0.0, 360.0, 30.0, dtype=torch.float64)
+    level = circular_geometry(angles.tolist(), sad=404, sdd=538, det_offset_mm=(3, -2), **SIZE)
+    # the central ray hits the detector 3 mm below and 2 mm beside its middle
+    leap = from_leap_cone(20, 31, 0.8, 1.2, 9.5 - 3 / 0.8, 15 + 2 / 1.2, angles + 90, 404, 538)
+    assert same(leap, level, 1e-12) and leap.angles_deg == tuple((angles + 90).tolist())
+    tigre = {"DSD": 538, "DSO": 404, "nDetector": (20, 31), "dDetector": (0.8, 1.2), "offDetector": (3, -2)}
+    assert same(from_tigre(SimpleNamespace(**tigre), torch.deg2rad(angles)), level, 1e-12)
+    moved = from_tigre(SimpleNamespace(**tigre, offOrigin=(1.0, 2.0, 3.0)), torch.deg2rad(angles))  # z, y, x
+    shift = level.source_positions - moved.source_positions
+    torch.testing.assert_close(shift, torch.tensor([3.0, 2.0, 1.0]).double().expand(12, 3))
+
+
+def test_leaps_and_tigres_axis_beside_the_central_ray():
+    """A point on LEAP's axis, tau beside the ray, is seen tau's magnified length beside the middle; in TIGRE the same."""
+    point = torch.zeros(1, 3, dtype=torch.float64)
+    leap = from_leap_cone(21, 31, 1.0, 1.0, 10, 15, [0.0, 70.0], 400, 600, tau=4.0)
+    tigre = SimpleNamespace(DSD=[600, 600], DSO=[400, 400], nDetector=(21, 31), dDetector=(1.0, 1.0), COR=-4.0)
+    for geometry in (leap, from_tigre(tigre, torch.deg2rad(torch.tensor([-90.0, -20.0])))):
+        pixels = geometry.project(point)[0]
+        torch.testing.assert_close(pixels, torch.tensor([[[21.0, 10.0]], [[21.0, 10.0]]]).double())
+    tilted = from_leap_cone(21, 31, 1.0, 1.0, 10, 15, [90.0], 400, 600, tilt_angle=90.0)
+    seen = tilted.project(torch.tensor([[0.0, 0.0, 2.0]]).double())[0]  # up is now along the columns
+    torch.testing.assert_close(seen, torch.tensor([[[18.0, 10.0]]]).double())
+    with pytest.raises(ValueError, match="mode cone, got parallel"):
+        from_tigre(SimpleNamespace(mode="parallel"), [0.0])
+    with pytest.raises(ValueError, match="turned in itself"):
+        from_tigre(SimpleNamespace(rotDetector=(0.0, 0.1, 0.0)), [0.0])
+    with pytest.raises(ValueError, match="one turn about z a view"):
+        from_tigre(tigre, torch.zeros(2, 3))
 
 
 def test_the_header_of_the_projections_says_what_the_pixels_are(tmp_path):

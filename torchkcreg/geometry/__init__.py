@@ -8,8 +8,9 @@ from torchkcreg.geometry.calibration import Calibration, calibrate
 from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
 from torchkcreg.geometry.distance import distance_to
-from torchkcreg.geometry.frames import DetectorFrames, from_astra, from_leap, gantry_about_z, to_astra, to_leap
+from torchkcreg.geometry.frames import DetectorFrames, gantry_about_z
 from torchkcreg.geometry.multisource import MultisourceScanner
+from torchkcreg.geometry.packages import from_astra, from_leap, from_leap_cone, from_tigre, to_astra, to_leap
 from torchkcreg.geometry.principal import principal_axes
 from torchkcreg.geometry.se3 import (
     across,
@@ -38,6 +39,8 @@ __all__ = [
     "fit_rigid",
     "from_astra",
     "from_leap",
+    "from_leap_cone",
+    "from_tigre",
     "gantry_about_z",
     "invert_rigid",
     "matrices_from_frames",

@@ -1,4 +1,4 @@
-"""Views as vectors in the world: focal spot, detector centre, steps of its pixels; to and from other packages."""
+"""Views as vectors in the world: focal spot, detector centre, steps of its pixels."""
 
 from __future__ import annotations
 
@@ -84,70 +84,6 @@ class DetectorFrames:
             pixel_spacing=spacing,
         )
         return ConeBeamGeometry(matrices, det_shape, spacing, sources=sources, angles_deg=angles_deg)
-
-
-def from_astra(vectors: Tensor, det_shape: Sequence[int]) -> ConeBeamGeometry:
-    """The geometry of ASTRA's `cone_vec`: rows (V, 12) of source, detector centre, column step and row step, in mm.
-
-    ASTRA's lengths are in units of its voxels: bring them to mm first. Its sinograms are (rows, V, cols), so views are
-    ``sinogram.swapaxes(0, 1)``.
-
-    Args:
-        vectors: (V, 12).
-        det_shape: (rows, cols).
-    """
-    vectors = torch.as_tensor(vectors).double()
-    if vectors.dim() != 2 or vectors.shape[1] != 12:
-        raise ValueError(f"cone_vec must have shape (V, 12), got {tuple(vectors.shape)}")
-    return DetectorFrames(*vectors.split(3, dim=1)).geometry(det_shape)
-
-
-def to_astra(geometry: ConeBeamGeometry) -> Tensor:
-    """ASTRA's `cone_vec` (V, 12) of a geometry, lengths in mm; see `from_astra`.
-
-    >>> from torchkcreg.geometry import circular_geometry
-    >>> views = circular_geometry([0.0], sad=400, sdd=600, det_shape=(5, 5), pixel_spacing=(2.0, 1.0))
-    >>> bool(torch.allclose(from_astra(to_astra(views), (5, 5)).projection_matrices, views.projection_matrices))
-    True
-    """
-    frames = DetectorFrames.of(geometry)
-    return torch.cat([frames.sources, frames.centers, frames.col_steps, frames.row_steps], dim=1)
-
-
-def from_leap(
-    source_positions: Tensor,
-    module_centers: Tensor,
-    row_vectors: Tensor,
-    col_vectors: Tensor,
-    *,
-    det_shape: Sequence[int],
-    pixel_spacing: Sequence[float],
-) -> ConeBeamGeometry:
-    """The geometry of LEAP's modular beam, all (V, 3) in mm, as `set_modularbeam` takes it.
-
-    Args:
-        source_positions: focal spots.
-        module_centers: middles of the detectors.
-        row_vectors: unit vectors along which the row index grows.
-        col_vectors: unit vectors along which the column index grows.
-        det_shape: (numRows, numCols).
-        pixel_spacing: (pixelHeight, pixelWidth), mm.
-    """
-    positions, centers, down, across = (
-        torch.as_tensor(x).double() for x in (source_positions, module_centers, row_vectors, col_vectors)
-    )
-    return DetectorFrames(positions, centers, pixel_spacing[1] * across, pixel_spacing[0] * down).geometry(det_shape)
-
-
-def to_leap(geometry: ConeBeamGeometry) -> dict[str, Tensor]:
-    """Vectors (V, 3) of LEAP's modular beam: what `from_leap` takes, by its names."""
-    frames = DetectorFrames.of(geometry)
-    return {
-        "source_positions": frames.sources,
-        "module_centers": frames.centers,
-        "row_vectors": torch.nn.functional.normalize(frames.row_steps, dim=-1),
-        "col_vectors": torch.nn.functional.normalize(frames.col_steps, dim=-1),
-    }
 
 
 def gantry_about_z(axis: str) -> Tensor:
