@@ -175,7 +175,7 @@ def test_parameters_of_leap_and_tigre_are_the_same_views():
 
 
 def test_leaps_and_tigres_axis_beside_the_central_ray():
-    """A point on LEAP's axis, tau beside the ray, is seen tau's magnified length beside the middle; in TIGRE the same."""
+    """A point on an axis that is tau beside the central ray is seen tau's magnified length beside the middle."""
     point = torch.zeros(1, 3, dtype=torch.float64)
     leap = from_leap_cone(21, 31, 1.0, 1.0, 10, 15, [0.0, 70.0], 400, 600, tau=4.0)
     tigre = SimpleNamespace(DSD=[600, 600], DSO=[400, 400], nDetector=(21, 31), dDetector=(1.0, 1.0), COR=-4.0)

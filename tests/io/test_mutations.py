@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -81,6 +82,25 @@ def _stack(path: Path) -> None:
     sitk.WriteImage(sitk.GetImageFromArray(_images()), str(path))
 
 
+def _hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["exchange/data"], file["exchange/data_white"] = _images(), np.full((2, 8, 10), 3000, np.uint16)
+
+
+def _dicom(path: Path) -> None:
+    image = sitk.GetImageFromArray(_images()[:1])
+    tags = {"0008|0060": "XA", "0018|1110": "1200", "0018|1111": "750", "0018|1164": "0.3\\0.3", "0018|1510": "20"}
+    for tag, value in tags.items():
+        image.SetMetaData(tag, value)
+    sitk.WriteImage(image, str(path))
+
+
+def _described(path: Path) -> None:
+    _images().tofile(path.with_suffix(".raw"))
+    raw = "{shape: [3, 8, 10], type: uint16, skip_bytes: 0}"
+    path.write_text(f"images: {path.stem}.raw\nopen_beam: 3000.0\nsaturation: 65535\nraw: {raw}\n")
+
+
 def _points(path: Path) -> None:
     write_points(path, torch.arange(18.0).reshape(6, 3))
 
@@ -107,6 +127,10 @@ READERS: dict[str, Reader] = {
     "npy": ("n.npy", lambda p: np.save(p, _images() / 3000.0), read_projections),
     "mha": ("n.mha", _stack, lambda p: read_projections(p, open_beam=3000.0)),
     "nrrd": ("n.nrrd", _stack, lambda p: read_projections(p, open_beam=3000.0)),
+    "tiff": ("n.tif", _stack, lambda p: read_projections(p, open_beam=3000.0)),
+    "hdf5": ("n.h5", _hdf5, read_projections),
+    "dicom": ("n.dcm", _dicom, lambda p: (read_geometry(p), read_projections(p, open_beam=3000.0))[1]),
+    "scan description": ("n.yaml", _described, read_projections),
     "binary stl": ("m.stl", lambda p: write_mesh(p, BOX), read_mesh),
     "text stl": ("m.stl", lambda p: p.write_text(trimesh.exchange.stl.export_stl_ascii(BOX)), read_mesh),
     "obj": ("m.obj", lambda p: write_mesh(p, BOX), read_mesh),
@@ -156,7 +180,7 @@ def finite(result: Any) -> bool:
 
 
 @pytest.mark.parametrize("kind", READERS)
-@pytest.mark.parametrize("examples", [200, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [200, pytest.param(10000, marks=pytest.mark.slow)])
 def test_a_damaged_file_is_read_or_refused_in_one_line(kind: str, examples: int, tmp_path: Path) -> None:
     name, write, read = READERS[kind]
     write(tmp_path / name)

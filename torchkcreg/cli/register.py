@@ -15,8 +15,8 @@ def add_register(commands) -> None:
     command = add_command(commands, "register", _register, "measure the deformation of an implant in a few projections")
     mesh = "closed mesh of the undeformed implant (mm); repeated, with --components, --init and --material, for several"
     command.add_argument("--implant", type=Path, action="append", required=True, help=mesh)
-    command.add_argument("--geometry", type=Path, required=True, help="projection matrices (JSON)")
-    command.add_argument("--projections", type=Path, required=True, help="intensities or line integrals (NPZ, MHA)")
+    command.add_argument("--geometry", type=Path, required=True, help="projection matrices (JSON, XML, NPY, CSV, DICOM)")
+    command.add_argument("--projections", type=Path, required=True, help="intensities or line integrals (NPZ, MHA, TIFF, a folder, YAML, ...)")
     command.add_argument("--out", type=Path, required=True, help="run folder to make")
     command.add_argument("--views", type=_integers, help="views to use, such as 15,16,17 (default: all)")
     steel = "material of the implant, such as steel: polyenergetic DRRs"

@@ -11,12 +11,13 @@ from .files import read_json, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .init import read_init, write_init
 from .matrix_tables import read_matrix_table, write_matrix_table
+from .measured import Projections
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
 from .plausible import implausible_magnification
 from .point_cloud_ply import read_point_cloud_ply
 from .points import read_points, write_points
 from .projection_file import ProjectionFile
-from .projections import Projections, read_projections, write_projections
+from .projections import read_projections, write_projections
 from .references import read_reference
 from .rtk_geometry import read_rtk, write_rtk
 from .runs import RunFolder, read_run

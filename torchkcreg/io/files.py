@@ -34,6 +34,11 @@ def existing_file(path: str | os.PathLike[str], what: str) -> Path:
     return path
 
 
+def existing_place(path: str | os.PathLike[str], what: str) -> Path:
+    """The path of an existing file or folder; raises as `existing_file`."""
+    return Path(path) if Path(path).is_dir() else existing_file(path, what)
+
+
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside `path` that takes its place when the block ends well, and vanishes when it fails.

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.io.files import existing_file, read_json, write_json
+from torchkcreg.io.dicom import DICOM_SUFFIXES, read_dicom_geometry
+from torchkcreg.io.files import existing_place, read_json, write_json
 from torchkcreg.io.images import image_header
 from torchkcreg.io.matrix_tables import SUFFIXES, read_matrix_table, write_matrix_table
 from torchkcreg.io.rtk_geometry import read_rtk, write_rtk
@@ -30,7 +31,7 @@ def read_geometry(
     pixel_spacing: Sequence[float] | None = None,
     layout: str | None = None,
 ) -> ConeBeamGeometry:
-    """The cone-beam geometry of a file: JSON, RTK's XML, or a table of matrices.
+    """The cone-beam geometry of a file: JSON, RTK's XML, DICOM, or a table of matrices.
 
     JSON has the keys `rows`, `cols`, `pixel_pitch_mm` (a number, or `[dv, du]`), `views`, a list of dicts with
     `projection_matrix` (3x4, world mm to homogeneous 0-based pixels), and optionally `angle_deg` and `source` (a label)
@@ -38,7 +39,8 @@ def read_geometry(
     view within 0.1 mm, and where pixel pitch and matrices put the detector against `sdd_mm` within 1 %. Other keys are
     ignored.
 
-    The other formats (`.xml`, see `read_rtk`; `.npy`, `.npz`, `.csv`, `.txt`, see `read_matrix_table`) do not say what
+    DICOM files of C-arms, or a folder of them, say what they meant to do: see `read_dicom_geometry`. The other formats
+    (`.xml`, see `read_rtk`; `.npy`, `.npz`, `.csv`, `.txt`, see `read_matrix_table`) do not say what
     the pixels are: the header of the projections' image does, or the arguments.
 
     Args:
@@ -53,8 +55,13 @@ def read_geometry(
         ValueError: it is malformed, contradicts itself, or nothing says what the pixels are; the message names the
             file, the view and the key.
     """
-    file = existing_file(path, "geometry")
+    file = existing_place(path, "geometry")
     suffix = file.suffix.lower()
+    if suffix in DICOM_SUFFIXES or file.is_dir():
+        try:
+            return read_dicom_geometry(file)
+        except ValueError as error:
+            raise ValueError(f"geometry file {path}: {error}") from error
     if suffix != ".xml" and suffix not in SUFFIXES:
         content = read_json(path, "geometry")
         try:

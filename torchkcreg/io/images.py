@@ -21,12 +21,17 @@ def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
 
     Raises:
         RuntimeError: It cannot be read, or its header asks for more than the file can hold.
+        ValueError: It holds more than one number a pixel.
     """
     reader = _opened(path)
-    cols, rows = reader.GetSize()[:2]
+    if reader.GetNumberOfComponents() != 1:
+        raise ValueError(f"it has {reader.GetNumberOfComponents()} numbers a pixel: grey images have one")
+    cols, rows, number = (*reader.GetSize(), 1)[:3]
+    if list(slices) == list(range(number)):
+        return sitk.GetArrayFromImage(reader.Execute()).reshape(number, rows, cols)
     found = []
-    for number in slices:
-        reader.SetExtractIndex([0, 0, number])
+    for index in slices:
+        reader.SetExtractIndex([0, 0, index])
         reader.SetExtractSize([cols, rows, 1])
         found.append(sitk.GetArrayFromImage(reader.Execute())[0])
     return np.stack(found)
@@ -69,9 +74,12 @@ def image_header(path: Path) -> PixelHeader | None:
     return PixelHeader((rows, cols), None if du == dv == 1.0 else (dv, du), (u0, v0))
 
 
-def read_image(path: Path) -> sitk.Image:
-    """The image of a file; raises as `read_slices`."""
-    return _opened(path).Execute()
+def read_image(path: Path, *, first: bool = False) -> sitk.Image:
+    """The image of a file, or its first slice alone; raises as `read_slices`."""
+    reader = _opened(path)
+    if first and len(reader.GetSize()) == 3:
+        reader.SetExtractSize([*reader.GetSize()[:2], 1])
+    return reader.Execute()
 
 
 def _opened(path: Path) -> sitk.ImageFileReader:

@@ -5,18 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from torchkcreg.io.files import existing_file
-from torchkcreg.io.images import num_slices, read_slices
-from torchkcreg.io.projections import IMAGE_SUFFIXES, Projections, check_views, converted
+from torchkcreg.io.files import existing_place
+from torchkcreg.io.image_series import open_series
+from torchkcreg.io.measured import Projections, check_views, converted
 
 
 class ProjectionFile:
     """A file of projections of which some views are read at a time; `len` says how many there are.
 
-    Files: `.npy`, and the images that `read_projections` reads; compressed ones are unpacked as a whole each time. A
+    Files: all that `read_projections` reads but `.npz`; compressed stacks are unpacked as a whole each time. A
     detector's ceiling, and pixels that are stuck there, are told from the views that are read together.
 
     Args:
@@ -29,21 +28,16 @@ class ProjectionFile:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, open_beam: ArrayLike | None = None) -> None:
-        self.path, self.open_beam = existing_file(path, "projections"), open_beam
-        self._array = None
+        self.path, self.open_beam = existing_place(path, "projections"), open_beam
+        if self.path.suffix.lower() == ".npz":
+            raise self._error(ValueError("views are read one by one from all kinds but .npz: write it as another"))
         try:
-            if self.path.suffix.lower() == ".npy":
-                self._array = np.load(self.path, mmap_mode="r", allow_pickle=False)
-                self._num_views = len(self._array)
-            elif self.path.name.lower().endswith(IMAGE_SUFFIXES):
-                self._num_views = num_slices(self.path)
-            else:
-                raise ValueError("views are read one by one from .npy and images: write it as one of these")
+            self._series = open_series(self.path)
         except (ValueError, RuntimeError, OSError, TypeError) as error:
             raise self._error(error) from error
 
     def __len__(self) -> int:
-        return self._num_views
+        return self._series.num_views
 
     def read(self, views: Sequence[int]) -> Projections:
         """Some views, in this order, as `read_projections` gives them.
@@ -53,8 +47,7 @@ class ProjectionFile:
         """
         try:
             check_views(views, len(self))
-            image = read_slices(self.path, views) if self._array is None else np.asarray(self._array[list(views)])
-            return converted({"image": image}, self.open_beam, None, None)
+            return converted(self._series.arrays(views), self.open_beam, None, None)
         except (ValueError, RuntimeError) as error:
             raise self._error(error) from error
 

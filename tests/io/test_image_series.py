@@ -1,0 +1,241 @@
+"""Projections wherever they are: folders, raw data, HDF5, DICOM, flat and dark fields."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK as sitk
+import torch
+from PIL import Image
+from pydicom.dataset import FileDataset, FileMetaDataset
+
+from torchkcreg.io import ProjectionFile, read_geometry, read_projections
+
+RANDOM = np.random.default_rng(5)
+LINES = RANDOM.uniform(0.2, 3, (12, 6, 7))
+FLAT = RANDOM.uniform(3000, 4000, (6, 7))
+DARK = RANDOM.uniform(50, 90, (6, 7))
+RAW = DARK + (FLAT - DARK) * np.exp(-LINES)
+
+
+def image(path: Path, array: np.ndarray) -> None:
+    sitk.WriteImage(sitk.GetImageFromArray(array), str(path))
+
+
+def dicom(path: Path, images: np.ndarray, **tags: object) -> None:
+    """An angiographic multi-frame file, by another library's writer."""
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.12.1"
+    meta.MediaStorageSOPInstanceUID = pydicom.uid.generate_uid()
+    meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
+    data = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
+    data.Modality, data.SamplesPerPixel, data.PhotometricInterpretation = "XA", 1, "MONOCHROME2"
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+    data.Rows, data.Columns = images.shape[-2:]
+    if images.ndim == 3:
+        data.NumberOfFrames = len(images)
+    for name, value in tags.items():
+        setattr(data, name, value)
+    data.PixelData = images.astype("<u2").tobytes()
+    data.save_as(path, enforce_file_format=True)
+
+
+def lines_of(path: Path, **options: object) -> np.ndarray:
+    return read_projections(path, **options).line_integrals.numpy()
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".mha", ".png", ".nii.gz"])
+def test_a_folder_has_one_file_a_view_in_the_order_of_their_numbers(tmp_path, suffix):
+    counts = np.round(RAW).astype(np.uint16)
+    for index, view in enumerate(counts):
+        image(tmp_path / f"view_{index}{suffix}", view)
+    (tmp_path / "notes.txt").write_text("tube at 90 kV")
+    expected = -np.log(counts / 4000)
+    np.testing.assert_allclose(lines_of(tmp_path, open_beam=4000), expected, atol=1e-6)
+    part = ProjectionFile(tmp_path, open_beam=4000)
+    assert len(part) == 12
+    np.testing.assert_allclose(part.read([10, 2]).line_integrals, expected[[10, 2]], atol=1e-6)
+
+
+def test_a_folder_whose_files_do_not_belong_together_is_refused_or_doubted(tmp_path):
+    with pytest.raises(ValueError, match="this one no images"):
+        read_projections(tmp_path)
+    for index in (0, 1, 2, 4, 5):
+        image(tmp_path / f"view_{index:03}.tif", RAW[index].astype(np.float32))
+    with pytest.warns(UserWarning, match="numbered 2 and then 4: is a view missing"):
+        read_projections(tmp_path, open_beam=4000)
+    image(tmp_path / "view_003.tif", RAW[0, :4].astype(np.float32))
+    with pytest.raises(ValueError, match=r"view_003.tif is 4 x 7 float32, the first image is 6 x 7 float32"):
+        read_projections(tmp_path, open_beam=4000)
+    (tmp_path / "view_003.tif").write_bytes(b"II*\0damaged")
+    with pytest.raises(ValueError, match=r"view_003.tif cannot be read"):
+        read_projections(tmp_path, open_beam=4000)
+    image(tmp_path / "thumbnail.png", np.zeros((4, 4), np.uint8))
+    with pytest.raises(ValueError, match=r"files of several kinds \(.png, .tif\)"):
+        read_projections(tmp_path, open_beam=4000)
+
+
+def test_a_description_names_raw_data_with_flat_and_dark_fields(tmp_path):
+    RAW.astype(">f4").tofile(tmp_path / "scan.raw")
+    (tmp_path / "flat").mkdir()
+    for index, factor in enumerate((0.9, 1.1)):
+        image(tmp_path / "flat" / f"{index}.tif", (factor * FLAT).astype(np.float32))
+    np.stack([DARK, DARK]).astype(">f4").tofile(tmp_path / "dark.raw")
+    text = "images: scan.raw\nflat: flat\ndark: dark.raw\nraw: {shape: [12, 6, 7], type: float32, byte_order: big}\n"
+    (tmp_path / "scan.yaml").write_text(text)
+    np.testing.assert_allclose(lines_of(tmp_path / "scan.yaml"), LINES, atol=1e-4)
+    np.testing.assert_allclose(ProjectionFile(tmp_path / "scan.yaml").read([3]).line_integrals, LINES[[3]], atol=1e-4)
+    (tmp_path / "scan.yaml").write_text(text.replace("[12, 6", "[13, 6"))
+    with pytest.raises(ValueError, match=r"scan.raw holds 2016 bytes .* 13 images of 6 x 7 float32 are 2184"):
+        read_projections(tmp_path / "scan.yaml")
+
+
+def test_pixels_that_the_open_beam_does_not_light_are_masked(tmp_path):
+    flat = FLAT.copy()
+    flat[2, 3] = DARK[2, 3]
+    np.savez(tmp_path / "p.npz", intensity=RAW, open_beam=flat, dark=DARK)
+    found = read_projections(tmp_path / "p.npz")
+    assert found.num_masked == {"without open beam": 12} and not found.mask[:, 2, 3].any() and found.mask[:, 0].all()
+    assert bool(found.line_integrals.isfinite().all())
+    np.savez(tmp_path / "p.npz", intensity=RAW, open_beam=DARK, dark=FLAT)
+    with pytest.raises(ValueError, match="above the dark field"):
+        read_projections(tmp_path / "p.npz")
+    np.savez(tmp_path / "p.npz", intensity=RAW, open_beam=FLAT, dark=DARK[:3])
+    with pytest.raises(ValueError, match=r"dark must be one number or an image \(6, 7\)"):
+        read_projections(tmp_path / "p.npz")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("images: ../secret.tif", "outside the description's folder"),
+        ("images: /etc/hostname", "outside the description's folder"),
+        ("images: gone.tif", "does not exist"),
+        ("images: s.yaml", "another description"),
+        ("images: a.mha\nflat: a.mha\nopen_beam: 3", "name one"),
+        ("images: a.mha\ndark: a.mha", "leaves the open beam unknown"),
+        ("images: a.mha\nline_integrals: true\nopen_beam: 4", "need no flat"),
+        ("images: a.mha\nflats: a.mha", "flats"),
+        ("images: a.mha\nflat: small.mha", "the views have"),
+        ("images: a.bin", "not .bin"),
+    ],
+)
+def test_a_description_that_is_wrong_is_refused(tmp_path, text, reason):
+    image(tmp_path / "a.mha", RAW.astype(np.float32))
+    image(tmp_path / "small.mha", RAW[:, :3].astype(np.float32))
+    (tmp_path / "a.bin").write_bytes(b"0123")
+    (tmp_path / "s.yaml").write_text(text)
+    with pytest.raises((ValueError, FileNotFoundError), match=reason):
+        read_projections(tmp_path / "s.yaml")
+
+
+def test_hdf5_of_data_exchange_nxtomo_or_one_dataset(tmp_path):
+    with h5py.File(tmp_path / "exchange.h5", "w") as file:
+        file["exchange/data"], file["exchange/data_white"] = RAW, np.stack([0.9 * FLAT, 1.1 * FLAT])
+        file["exchange/data_dark"] = DARK[None]
+    np.testing.assert_allclose(lines_of(tmp_path / "exchange.h5"), LINES, atol=1e-4)
+    with h5py.File(tmp_path / "nx.nxs", "w") as file:
+        group = file.create_group("entry1/tomo_entry/instrument/detector")
+        group["data"] = np.concatenate([FLAT[None], DARK[None], RAW, FLAT[None]])
+        group["image_key"] = [1, 2, *[0] * 12, 1]
+    np.testing.assert_allclose(lines_of(tmp_path / "nx.nxs"), LINES, atol=1e-4)
+    np.testing.assert_allclose(ProjectionFile(tmp_path / "nx.nxs").read([11]).line_integrals, LINES[[11]], atol=1e-4)
+    with h5py.File(tmp_path / "two.h5", "w") as file:
+        file["a/views"], file["b/views"] = LINES, 2 * LINES
+    with pytest.raises(ValueError, match=r"2 datasets of three dimensions \(a/views, b/views\): name one"):
+        read_projections(tmp_path / "two.h5")
+    (tmp_path / "s.yaml").write_text("images: two.h5\ndataset: /b/views\n")
+    np.testing.assert_allclose(lines_of(tmp_path / "s.yaml"), 2 * LINES, rtol=1e-6)
+    with h5py.File(tmp_path / "bomb.h5", "w") as file:
+        file.create_dataset("views", (10**6, 4096, 4096), "f4", chunks=(1, 64, 64))
+    with pytest.raises(ValueError, match="more than a file of"):
+        read_projections(tmp_path / "bomb.h5")
+    (tmp_path / "no.h5").write_text("nothing")
+    with pytest.raises(ValueError, match="is no HDF5 file"):
+        read_projections(tmp_path / "no.h5")
+
+
+XA = {
+    "DistanceSourceToDetector": 1200,
+    "DistanceSourceToPatient": 750,
+    "ImagerPixelSpacing": [0.4, 0.3],
+    "PositionerPrimaryAngle": -30,
+    "PositionerSecondaryAngle": 0,
+}
+
+
+def test_a_c_arms_dicom_file_is_projections_and_geometry(tmp_path):
+    """At angle 0 the detector is in front; the left side is on the right of the image and the head at the top."""
+    counts = np.round(RAW[:3]).astype(np.uint16)
+    dicom(tmp_path / "run.dcm", counts, **XA, PositionerPrimaryAngleIncrement=[0, 30, 120])
+    np.testing.assert_allclose(lines_of(tmp_path / "run.dcm", open_beam=4000), -np.log(counts / 4000), atol=1e-6)
+    geometry = read_geometry(tmp_path / "run.dcm")
+    assert geometry.det_shape == (6, 7) and geometry.pixel_spacing == pytest.approx((0.4, 0.3))
+    assert geometry.angles_deg == pytest.approx((-30, 0, 90))
+    source = torch.tensor([[0.0, 750.0, 0.0]]).double()
+    torch.testing.assert_close(geometry.source_positions[1:2], source)
+    left_and_head = torch.tensor([[1.0, 0, 0], [0, 0, 1.0]]).double()
+    pixels = geometry.project(left_and_head)[0]
+    torch.testing.assert_close(pixels[1], torch.tensor([[3 + 1.6 / 0.3, 2.5], [3, 2.5 - 1.6 / 0.4]]).double())
+    torch.testing.assert_close(geometry.source_positions[2], torch.tensor([-750.0, 0, 0]).double())  # detector left
+    dicom(tmp_path / "cra.dcm", counts[:1], **{**XA, "PositionerPrimaryAngle": 0, "PositionerSecondaryAngle": 30})
+    assert float(read_geometry(tmp_path / "cra.dcm").source_positions[0, 2]) == pytest.approx(-375)  # detector up
+    dicom(tmp_path / "steady.dcm", counts, **XA, PositionerPrimaryAngleIncrement=2.5)
+    assert read_geometry(tmp_path / "steady.dcm").angles_deg == pytest.approx((-30, -27.5, -25))
+
+
+def test_a_folder_of_dicom_files_is_in_the_order_of_their_numbers(tmp_path):
+    counts = np.round(RAW[:3]).astype(np.uint16)
+    for name, number in (("a", 2), ("b", 0), ("c", 1)):
+        dicom(
+            tmp_path / f"{name}.dcm",
+            counts[number],
+            **{**XA, "PositionerPrimaryAngle": 10 * number, "InstanceNumber": number},
+        )
+    np.testing.assert_allclose(lines_of(tmp_path, open_beam=4000), -np.log(counts / 4000), atol=1e-6)
+    assert read_geometry(tmp_path).angles_deg == pytest.approx((0, 10, 20))
+
+
+def test_dicom_that_does_not_say_enough_is_refused(tmp_path):
+    def refused(reason: str, **tags: object) -> None:
+        dicom(tmp_path / "x.dcm", RAW[:3], **{**XA, **tags})
+        with pytest.raises(ValueError, match=reason):
+            read_geometry(tmp_path / "x.dcm")
+
+    refused("do not say DistanceSourceToDetector", DistanceSourceToDetector=None)
+    refused("must lie between 0 and", DistanceSourceToPatient=1300)
+    refused("Increment has 2 values for 3 frames", PositionerPrimaryAngleIncrement=[0, 1])
+    refused("flipped or turned", FieldOfViewHorizontalFlip="YES")
+    dicom(tmp_path / "x.dcm", RAW[:3], **XA, PixelIntensityRelationship="DISP")
+    with pytest.raises(ValueError, match="pixels are DISP of the X-ray intensity"):
+        read_projections(tmp_path / "x.dcm", open_beam=4000)
+    (tmp_path / "x.dcm").write_bytes(b"DICM")
+    with pytest.raises(ValueError, match="no DICOM file"):
+        read_geometry(tmp_path / "x.dcm")
+
+
+def test_colours_are_no_projections(tmp_path):
+    image = sitk.GetImageFromArray(np.zeros((4, 5, 6, 3), np.uint8), isVector=True)
+    sitk.WriteImage(image, str(tmp_path / "c.mha"))
+    with pytest.raises(ValueError, match="3 numbers a pixel"):
+        read_projections(tmp_path / "c.mha")
+    Image.new("RGB", (5, 4)).save(tmp_path / "c.tif")
+    with pytest.raises(ValueError, match="kind RGB, not grey"):
+        read_projections(tmp_path / "c.tif")
+
+
+def test_pages_of_a_tiff_are_views(tmp_path):
+    """Written by another library, compressed, of 16 bits and of floats."""
+    counts = np.round(RAW).astype(np.uint16)
+    pages = [Image.fromarray(view) for view in counts]
+    pages[0].save(tmp_path / "p.tif", save_all=True, append_images=pages[1:], compression="tiff_lzw")
+    np.testing.assert_allclose(lines_of(tmp_path / "p.tif", open_beam=4000), -np.log(counts / 4000), atol=1e-6)
+    part = ProjectionFile(tmp_path / "p.tif", open_beam=4000).read([11, 0])
+    np.testing.assert_allclose(part.line_integrals, -np.log(counts[[11, 0]] / 4000), atol=1e-6)
+    image(tmp_path / "f.tif", LINES.astype(np.float32))
+    np.testing.assert_allclose(lines_of(tmp_path / "f.tif"), LINES, rtol=1e-6)

@@ -1,0 +1,131 @@
+"""DICOM: which views a file holds, what its pixels are, and the geometry as far as its tags say it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchkcreg.geometry import ConeBeamGeometry, DetectorFrames
+
+DICOM_SUFFIXES = (".dcm", ".ima")
+NEEDED = "DICOM files need pydicom: pip install 'torchkcreg[io]'"
+
+
+def instance_number(path: Path) -> float:
+    """A file's place in its series; 0 where it says none."""
+    return _number(_tags(path), "InstanceNumber", 0)
+
+
+def dicom_images(path: Path) -> NDArray:
+    """The frames (V, rows, cols) of a file, in proportion to the X-ray intensity.
+
+    Raises:
+        ValueError: damaged, in colours, compressed in a way that nothing here unpacks, or prepared for display.
+        ImportError: pydicom is not installed.
+    """
+    data = _tags(path, pixels=True)
+    relation = data.get("PixelIntensityRelationship", "") or ""
+    if relation not in ("", "LIN"):
+        raise ValueError(
+            f"its pixels are {relation} of the X-ray intensity (PixelIntensityRelationship), not in proportion to it: "
+            "ask the scanner for unprocessed images"
+        )
+    try:
+        images = np.asarray(data.pixel_array)
+    except Exception as error:  # pydicom's and its decoders' own
+        raise ValueError(f"{path.name} has no pixels that can be read: {str(error).splitlines()[0]}") from error
+    if int(data.get("SamplesPerPixel", 1) or 1) != 1:
+        raise ValueError(f"{path.name} has {data.SamplesPerPixel} numbers a pixel: grey images have one")
+    slope, intercept = _number(data, "RescaleSlope", 1.0), _number(data, "RescaleIntercept", 0.0)
+    images = images if (slope, intercept) == (1.0, 0.0) else (images * slope + intercept).astype(np.float32)
+    return images.reshape(-1, *images.shape[-2:])
+
+
+def read_dicom_geometry(path: Path) -> ConeBeamGeometry:
+    """The geometry of an angiographic (XA) multi-frame file, or of a folder with a file a view, by its tags.
+
+    The world is the patient's of a supine one at the isocentre: x to the left, y to the back, z to the head. The
+    detector is in front at angle 0, moves to the left with the primary angle (LAO) and to the head with the secondary
+    one (CRA). Rows run to the feet. DistanceSourceToPatient is taken for that to the isocentre.
+
+    These are what the scanner meant to do: C-arms sag by millimetres, which a registration's `view_motion` can find.
+
+    Raises:
+        ValueError: tags are missing or contradict each other, or images are flipped or turned.
+    """
+    files = sorted(path.iterdir(), key=lambda file: file.name) if path.is_dir() else [path]
+    files = [file for file in files if file.suffix.lower() in DICOM_SUFFIXES]
+    if not files:
+        raise ValueError("holds no DICOM files (.dcm)")
+    tags = sorted((_tags(file) for file in files), key=lambda one: int(_number(one, "InstanceNumber", 0)))
+    first = tags[0]
+    if first.get("FieldOfViewHorizontalFlip", "") == "YES" or _number(first, "FieldOfViewRotation", 0) != 0:
+        raise ValueError("images are flipped or turned against the detector (FieldOfView tags): undo that first")
+    primary, secondary = (
+        torch.cat([_angles(one, name) for one in tags]).deg2rad()
+        for name in ("PositionerPrimaryAngle", "PositionerSecondaryAngle")
+    )
+    sad, sdd = _number(first, "DistanceSourceToPatient"), _number(first, "DistanceSourceToDetector")
+    if not 0 < sad < sdd:
+        raise ValueError(f"DistanceSourceToPatient {sad:g} mm must lie between 0 and DistanceSourceToDetector {sdd:g}")
+    spacing = _numbers(first, "ImagerPixelSpacing")
+    if len(spacing) != 2 or min(spacing) <= 0:
+        raise ValueError(f"ImagerPixelSpacing must be two positive numbers, got {spacing}")
+    sin_a, cos_a, sin_b, cos_b = primary.sin(), primary.cos(), secondary.sin(), secondary.cos()
+    towards = torch.stack([sin_a * cos_b, -cos_a * cos_b, sin_b], dim=1)  # from the isocentre to the detector
+    across = torch.stack([cos_a, sin_a, torch.zeros_like(sin_a)], dim=1)
+    down = torch.stack([sin_a * sin_b, -cos_a * sin_b, -cos_b], dim=1)
+    frames = DetectorFrames(-sad * towards, (sdd - sad) * towards, spacing[1] * across, spacing[0] * down)
+    size = int(_number(first, "Rows")), int(_number(first, "Columns"))
+    return frames.geometry(size, angles_deg=primary.rad2deg().tolist())
+
+
+def _angles(tags: Any, name: str) -> Tensor:
+    """Degrees of each frame: the initial angle, and an average step or each frame's offset (PS3.3 C.8.7.5.1.3)."""
+    frames = int(_number(tags, "NumberOfFrames", 1))
+    start = _number(tags, name, 0.0 if name == "PositionerSecondaryAngle" else None)
+    steps = _numbers(tags, f"{name}Increment") if tags.get(f"{name}Increment") is not None else [0.0]
+    if len(steps) == 1:
+        return start + steps[0] * torch.arange(frames, dtype=torch.float64)
+    if len(steps) != frames:
+        raise ValueError(f"{name}Increment has {len(steps)} values for {frames} frames")
+    return start + torch.tensor(steps, dtype=torch.float64)
+
+
+def _tags(path: Path, *, pixels: bool = False) -> Any:
+    """What a file says, with or without its pixels."""
+    try:
+        import pydicom
+    except ImportError:
+        raise ImportError(NEEDED) from None
+    try:
+        return pydicom.dcmread(path, stop_before_pixels=not pixels)
+    except Exception as error:  # pydicom's own, and what damaged files make of struct and decoders
+        raise ValueError(f"{path.name} is no DICOM file that can be read") from error
+
+
+def _number(tags: Any, name: str, default: float | None = None) -> float:
+    if default is not None and tags.get(name) is None:
+        return default
+    return _numbers(tags, name)[0]
+
+
+def _numbers(tags: Any, name: str) -> list[float]:
+    try:
+        value = tags.get(name)
+        if value is None:
+            raise ValueError(f"DICOM tags do not say {name}: give a geometry of another kind")
+        values = [float(part) for part in (value if not isinstance(value, (str, int, float)) else [value])]
+    except (TypeError, ValueError) as error:
+        if "do not say" in str(error):
+            raise
+        raise ValueError(f"DICOM tag {name} must hold numbers") from None
+    if not values or not all(math.isfinite(one) for one in values):
+        raise ValueError(f"DICOM tag {name} must hold finite numbers, got {values}")
+    return values

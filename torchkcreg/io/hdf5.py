@@ -1,0 +1,106 @@
+"""Projections in HDF5: Data Exchange, NXtomo, or any dataset by name (h5py)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs")
+_MOST_PACKED = 5000  # as of images: how many times larger than its file a dataset can be
+_SMALLEST = 1 << 16
+_PROJECTION, _FLAT, _DARK = 0, 1, 2  # of NXtomo's image_key
+
+
+@dataclass(frozen=True)
+class Hdf5Images:
+    """As `ImageSeries`."""
+
+    num_views: int
+    read: Callable[[Sequence[int]], NDArray]
+    beside: dict[str, NDArray] = field(default_factory=dict)
+
+
+def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
+    """The projections of an HDF5 file, with the means of its flat and dark fields.
+
+    Without a name, they are those of Data Exchange (`exchange/data`, `data_white`, `data_dark`), of NXtomo (`image_key`
+    beside `data`), or the only dataset of three dimensions.
+
+    Raises:
+        ValueError: no HDF5, no such dataset, or several that may be meant.
+        ImportError: h5py is not installed.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise ImportError("HDF5 files need h5py: pip install 'torchkcreg[io]'") from None
+    with _opened(h5py, path) as file:
+        stacks: dict[str, Any] = {}
+        file.visititems(lambda name, item: stacks.update({name: item}) if getattr(item, "ndim", 0) == 3 else None)
+        name = _chosen(stacks, dataset)
+        data = stacks[name]
+        _check(data, name, path)
+        fields: dict[str, NDArray] = {}
+        views = list(range(len(data)))
+        parent = data.parent
+        if name.endswith("exchange/data"):
+            for key, kind in (("data_white", "open_beam"), ("data_dark", "dark")):
+                if key in parent:
+                    _check(parent[key], key, path)
+                    fields[kind] = _mean(parent[key], range(len(parent[key])))
+        elif "image_key" in parent and parent["image_key"].shape == (len(data),):
+            keys = parent["image_key"][()]
+            views = np.flatnonzero(keys == _PROJECTION).tolist()
+            for number, kind in ((_FLAT, "open_beam"), (_DARK, "dark")):
+                if (keys == number).any():
+                    fields[kind] = _mean(data, np.flatnonzero(keys == number))
+
+    def read(indices: Sequence[int]) -> NDArray:
+        with _opened(h5py, path) as again:
+            return np.stack([again[name][views[index]] for index in indices])
+
+    return Hdf5Images(len(views), read, fields)
+
+
+def _opened(h5py: Any, path: Path) -> Any:
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise ValueError(f"is no HDF5 file that can be read: {str(error).splitlines()[0]}") from error
+
+
+def _chosen(stacks: dict[str, Any], dataset: str | None) -> str:
+    if dataset is not None:
+        if dataset.strip("/") not in stacks:
+            raise ValueError(f"has no dataset {dataset} of three dimensions; it has {', '.join(stacks) or 'none'}")
+        return dataset.strip("/")
+    known = [name for name, data in stacks.items() if name.endswith("exchange/data") or "image_key" in data.parent]
+    for names in (known, list(stacks)):
+        if len(names) == 1:
+            return names[0]
+    if not stacks:
+        raise ValueError("has no dataset of three dimensions")
+    raise ValueError(
+        f"has {len(stacks)} datasets of three dimensions ({', '.join(list(stacks)[:5])}): name one as `dataset` in a "
+        "scan description"
+    )
+
+
+def _check(data: Any, name: str, path: Path) -> None:
+    if data.dtype.kind not in "uif":
+        raise ValueError(f"dataset {name} holds no numbers, but {data.dtype}")
+    size = path.stat().st_size
+    if data.nbytes > max(_SMALLEST, _MOST_PACKED * size) or data.size == 0:
+        raise ValueError(f"dataset {name} claims {data.shape} numbers, more than a file of {size} bytes can hold")
+
+
+def _mean(data: Any, indices: Sequence[int] | NDArray) -> NDArray:
+    total = np.zeros(data.shape[1:], np.float64)
+    for index in indices:
+        total += data[int(index)]
+    return (total / max(len(indices), 1)).astype(np.float32)

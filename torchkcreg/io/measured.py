@@ -1,0 +1,181 @@
+"""Projections as line integrals with a mask of the pixels that hold a measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from torchkcreg.geometry import ConeBeamGeometry
+from torchkcreg.io.plausible import ImageHeader, stuck_pixels
+from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
+
+RELATIVE_FLOOR = 1e-6
+MOSTLY = 0.5  # of the pixels an open beam must light
+DETECTOR_CEILINGS = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 16))
+
+
+@dataclass(frozen=True)
+class Projections:
+    """Line integrals -ln(I / I0) and the pixels where they mean something.
+
+    Attributes:
+        line_integrals: float32 (V, rows, cols), finite everywhere (masked pixels hold a stand-in).
+        mask: bool (V, rows, cols), True where a pixel counts.
+        num_masked: how many pixels do not count, by reason: "not finite", "not positive" (intensities at or below
+            zero, or the dark field), "in the file's mask", "without open beam", "stuck at the ceiling". Reasons that
+            never occurred are left out.
+        num_saturated: pixels at the detector's ceiling; they count (see `read_projections`).
+        header: what the file says of pixels and axes; None where it says nothing.
+    """
+
+    line_integrals: Tensor
+    mask: Tensor
+    num_masked: dict[str, int] = field(default_factory=dict)
+    num_saturated: int = 0
+    header: ImageHeader | None = None
+
+    def select(self, views: Sequence[int]) -> Projections:
+        """The given views alone, in the given order; the counts stay those of the whole."""
+        check_views(views, len(self.line_integrals))
+        index = list(views)
+        return replace(self, line_integrals=self.line_integrals[index], mask=self.mask[index])
+
+    def masked_note(self) -> str | None:
+        """How many pixels do not count, and why, in words; None where all do."""
+        if not self.num_masked:
+            return None
+        reasons = ", ".join(f"{count} {reason}" for reason, count in self.num_masked.items())
+        return f"{sum(self.num_masked.values())} pixels are masked ({reasons})"
+
+    def check_against(self, geometry: ConeBeamGeometry) -> None:
+        """Nothing; ValueError when the geometry has another number of views or another detector.
+
+        A header whose pixels or axes contradict the geometry gives a warning.
+        """
+        have = tuple(self.line_integrals.shape)
+        want = (geometry.num_views, *(int(n) for n in geometry.det_shape))
+        if have != want:
+            raise ValueError(f"projections have (views, rows, cols) = {have}, the geometry has {want}")
+        if self.header is not None:
+            self.header.check_against(geometry)
+
+
+def converted(
+    arrays: dict[str, NDArray], open_beam: ArrayLike | None, saturation: float | None, views: Sequence[int] | None
+) -> Projections:
+    """What a file's arrays hold, by their names; an "image" is intensity where there is an open beam."""
+    beam = arrays.get("open_beam") if open_beam is None else np.asarray(open_beam)
+    if "image" in arrays:
+        arrays["line_integrals" if beam is None else "intensity"] = arrays.pop("image")
+    if ("intensity" in arrays) == ("line_integrals" in arrays):
+        raise ValueError("needs either intensity (with open_beam) or line_integrals")
+    kind = "intensity" if "intensity" in arrays else "line_integrals"
+    image = arrays[kind]
+    if image.ndim != 3 or 0 in image.shape or image.dtype.kind not in "uif":
+        raise ValueError(f"{kind} must be numbers of shape (V, rows, cols), got {image.dtype} {image.shape}")
+    kept = arrays.get("mask", np.broadcast_to(True, image.shape))
+    if kept.shape != image.shape or kept.dtype.kind not in "buif":
+        raise ValueError(f"mask must be numbers of the shape {image.shape} of {kind}, got {kept.dtype} {kept.shape}")
+    mask = kept != 0
+    beam = None if beam is None else _open_beam(beam, image.shape)
+    if views is not None:
+        check_views(views, len(image))
+        index = list(views)
+        image, mask = image[index], mask[index]
+        beam = beam[index] if beam is not None and len(beam) > 1 else beam
+    if kind == "line_integrals":
+        return _from_line_integrals(image, mask)
+    if beam is None:
+        raise ValueError("has intensity but no open_beam, the intensity without an object: give it")
+    dark = _dark(arrays["dark"], image.shape[1:]) if "dark" in arrays else np.zeros((1, 1, 1))
+    if saturation is None and "saturation" in arrays:
+        said = arrays["saturation"]
+        if said.size != 1 or said.dtype.kind not in "uif":
+            raise ValueError(f"saturation must be one number, got {said.dtype} {said.shape}")
+        saturation = float(said.reshape(()))
+    return _from_intensity(image, mask, beam, dark, saturation)
+
+
+def _from_line_integrals(image: NDArray, mask: NDArray) -> Projections:
+    if image.dtype.kind in "ui":
+        raise ValueError(f"{image.dtype} values look like intensities, not line integrals: give their open_beam")
+    finite = np.abs(image) < np.finfo(np.float32).max  # which NaN is not either
+    values = torch.from_numpy(np.where(finite, image, 0).astype(np.float32))
+    return Projections(values, torch.from_numpy(finite & mask), _counts(finite, finite, mask))
+
+
+def _from_intensity(
+    image: NDArray, mask: NDArray, beam: NDArray, dark: NDArray, saturation: float | None
+) -> Projections:
+    finite = np.abs(image) < np.finfo(np.float32).max
+    positive = np.greater(image, dark, where=finite, out=np.zeros_like(finite))
+    lit = np.broadcast_to(beam > dark, image.shape).copy()
+    if lit.mean() < MOSTLY:
+        raise ValueError("open_beam must be above the dark field, or 0 without one, in most pixels")
+    largest = image.max() if image.dtype.kind in "ui" else None
+    ceiling = saturation if saturation is not None else largest if largest in DETECTOR_CEILINGS else None
+    if ceiling is not None and ceiling <= 0:
+        raise ValueError(f"saturation must be positive, got {ceiling}")
+    saturated = np.zeros_like(finite) if ceiling is None else positive & (image >= ceiling)
+    counts = np.where(saturated, np.float64(ceiling or 0), image) - dark
+    net = np.where(beam > dark, beam - dark, 1.0)
+    floor = COUNT_FLOOR if image.dtype.kind in "ui" else RELATIVE_FLOOR * float(net.min())
+    line_integrals, valid = line_integrals_from_intensity(
+        torch.from_numpy(counts.astype(np.float32)), torch.from_numpy(net.astype(np.float32)), floor=floor
+    )
+    keep = valid & torch.from_numpy(finite & positive & lit & mask)
+    line_integrals = torch.where(torch.isfinite(line_integrals) & torch.from_numpy(lit), line_integrals, 0.0).float()
+    reasons = _counts(finite, positive, mask)
+    if dead := int((finite & positive & mask & ~lit).sum()):
+        reasons["without open beam"] = dead
+    if ceiling is not None and (stuck := stuck_pixels(image, saturated, float(ceiling))).any():
+        reasons["stuck at the ceiling"] = int((stuck & keep.numpy()).sum())
+        keep = keep & ~torch.from_numpy(stuck)
+    return Projections(line_integrals, keep, reasons, int(saturated.sum()))
+
+
+def _counts(finite: NDArray, positive: NDArray, mask: NDArray) -> dict[str, int]:
+    counts = {
+        "not finite": int((~finite).sum()),
+        "not positive": int((finite & ~positive).sum()),
+        "in the file's mask": int((positive & ~mask).sum()),
+    }
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def _open_beam(beam: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """The open beam with three dimensions that broadcast to `shape`."""
+    if beam.dtype.kind not in "uif" or not np.isfinite(beam).all() or beam.size == 0 or beam.max() <= 0:
+        raise ValueError(f"open_beam must be positive and finite, got {np.array2string(beam, threshold=4)}")
+    if beam.ndim == 1 and len(beam) == shape[0]:
+        beam = beam[:, None, None]
+    try:
+        np.broadcast_to(beam, shape)
+    except ValueError:
+        raise ValueError(f"open_beam must broadcast to {shape}, got shape {beam.shape}") from None
+    return beam.reshape((1,) * (3 - beam.ndim) + beam.shape)
+
+
+def _dark(dark: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """The dark field, (1, 1, 1) or (1, rows, cols)."""
+    if dark.dtype.kind not in "uif" or not np.isfinite(dark).all() or dark.size == 0 or dark.min() < 0:
+        raise ValueError("dark must be finite numbers of at least 0")
+    if dark.size == 1:
+        return dark.reshape(1, 1, 1).astype(np.float64)
+    if dark.shape[-2:] != tuple(shape) or dark.size != np.prod(shape):
+        raise ValueError(f"dark must be one number or an image {tuple(shape)}, got shape {dark.shape}")
+    return dark.reshape(1, *shape).astype(np.float64)
+
+
+def check_views(views: Sequence[int], num_views: int) -> None:
+    """Nothing; ValueError where there are no views, or one that does not exist."""
+    if len(views) == 0:
+        raise ValueError("views must name at least one view")
+    for view in views:
+        if not 0 <= view < num_views:
+            raise ValueError(f"there is no view {view}: the projections have views 0 to {num_views - 1}")
