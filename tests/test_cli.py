@@ -190,8 +190,9 @@ def test_info_alone_says_what_is_installed_and_which_projector_runs(capsys):
     assert "projector backend " in out
 
 
-def test_info_of_a_file_of_another_kind_is_an_error(small_case, capsys):
-    assert main(["info", str(small_case / "spectrum.csv")]) == 2
+def test_info_of_a_file_of_another_kind_is_an_error(tmp_path, capsys):
+    (tmp_path / "notes.md").write_text("90 kV")
+    assert main(["info", str(tmp_path / "notes.md")]) == 2
     assert "none of what can be described" in the_error(capsys, "info")
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import logging
+import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +16,8 @@ import torch
 
 import torchkcreg.experiments  # noqa: F401  (its modules are patched)
 from torchkcreg import cli
-from torchkcreg.console import run_command
+from torchkcreg.console import Answer, Voice, run_command
+from torchkcreg.progress import progress_bar
 
 
 def broken(kind: str) -> None:
@@ -57,14 +62,52 @@ def test_a_failure_that_nothing_foresaw_names_its_step(capsys, tmp_path, monkeyp
 
 def test_debug_raises_and_warnings_are_lines(capsys):
     with pytest.raises(KeyError):
-        run_command("x", lambda: broken("key"), debug=True)
+        run_command("x", lambda: broken("key"), Voice(debug=True))
 
-    def warns() -> int:
+    def warns() -> Answer:
         warnings.warn("careful,\nit is hot", stacklevel=1)
-        return 3
+        return Answer("", status=3)
 
     assert run_command("x", warns) == 3
     assert capsys.readouterr().err == "x: warning: careful, it is hot\n"
+
+
+def test_what_was_found_is_said_as_was_asked(capsys):
+    def found() -> Answer:
+        print("on the way")
+        logging.getLogger("torchkcreg.some.step").info("step %d", 1)
+        warnings.warn("it is hot", stacklevel=1)
+        return Answer("two views", {"views": 2, "folder": Path("run"), "gc": float("nan")})
+
+    assert run_command("x", found) == 0
+    told = capsys.readouterr()
+    assert told.out == "on the way\ntwo views\n" and told.err == "x: warning: it is hot\n"
+    run_command("x", found, Voice(quiet=True))
+    told = capsys.readouterr()
+    assert told.out == "" and told.err == "x: warning: it is hot\n"
+    run_command("x", found, Voice(json=True))
+    told = capsys.readouterr()
+    assert json.loads(told.out) == {"views": 2, "folder": "run", "gc": None, "warnings": ["it is hot"]}
+    assert "on the way" in told.err
+    run_command("x", found, Voice(verbose=True))
+    assert re.search(r"x: +0\.\d s  step 1\n", capsys.readouterr().err)
+    run_command("x", found)
+    assert "step 1" not in capsys.readouterr().err
+
+
+def test_quiet_silences_bars_and_only_for_as_long_as_the_command_runs(capsys):
+    list(progress_bar(range(3), shown=True))
+    assert "3/3" in capsys.readouterr().err
+    run_command("x", lambda: Answer(str(list(progress_bar(range(3), shown=True)))), Voice(quiet=True))
+    assert capsys.readouterr().err == ""
+    list(progress_bar(range(3), shown=True))
+    assert "3/3" in capsys.readouterr().err
+
+
+def test_the_shell_is_told_commands_and_flags(capsys):
+    assert cli.main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    assert "--soft-tissue" in script and "reconstruct" in script
 
 
 def test_info_takes_the_open_beam_that_a_file_lacks(capsys, tmp_path):

@@ -7,7 +7,8 @@ PACKAGE = Path(__file__).resolve().parent.parent / "torchkcreg"
 FLOORS = {
     "callbacks": 0,
     "config": 0,
-    "console": 0,
+    "console": 1,
+    "progress": 0,
     "differentiable": 0,
     "parameters": 0,
     "plain": 0,

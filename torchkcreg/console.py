@@ -1,43 +1,113 @@
-"""What people read: how a command ends, with warnings of a line each and an error of one line, and tables."""
+"""What people read: what a command found, warnings of a line each, an error of one line, and tables."""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
+import logging
 import sys
+import time
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+from torchkcreg.plain import plain
+from torchkcreg.progress import silence
 
 WRONG, INTERRUPTED = 2, 130  # exit statuses
 _PACKAGE = Path(__file__).parent
 
 
-def run_command(name: str, command: Callable[[], int | None], *, debug: bool = False) -> int:
+@dataclass(frozen=True)
+class Answer:
+    """What a command found.
+
+    Attributes:
+        text: for people.
+        data: the same for programs, plain data by name.
+        status: exit status.
+    """
+
+    text: str
+    data: dict[str, Any] = field(default_factory=dict)
+    status: int = 0
+
+
+@dataclass(frozen=True)
+class Voice:
+    """How much a command says, and to whom.
+
+    Attributes:
+        quiet: nothing but warnings and errors.
+        verbose: each step with the time it came at.
+        json: one JSON object on stdout with what was found and the warnings; all else on stderr.
+        debug: errors are raised, with their traceback.
+    """
+
+    quiet: bool = False
+    verbose: bool = False
+    json: bool = False
+    debug: bool = False
+
+
+def run_command(name: str, command: Callable[[], Answer | None], voice: Voice = Voice()) -> int:
     """The exit status of a command: its own, or that of its failure, which is told on stderr in one line.
 
     Args:
         name: What the lines begin with.
-        command: Returns its exit status, None for 0.
-        debug: Errors are raised instead.
+        command: Returns what it found.
+        voice: How much is said.
     """
+    told: list[str] = []
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        print(f"{name}: warning: {one_line(message)}", file=sys.stderr)
+        told.append(one_line(message))
+        print(f"{name}: warning: {told[-1]}", file=sys.stderr)
 
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _spoken(name, voice):
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show
-            return command() or 0
+            answer = command() or Answer("")
+        if voice.json:
+            print(json.dumps(plain({**answer.data, "warnings": told}), allow_nan=False))
+        elif answer.text and not voice.quiet:
+            print(answer.text)
+        return answer.status
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
-        if debug:
+        if voice.debug:
             raise
         print(f"{name}: error: {_told(error)}", file=sys.stderr)
         return WRONG
+
+
+@contextlib.contextmanager
+def _spoken(name: str, voice: Voice) -> Iterator[None]:
+    """Progress and what is printed on the way go where they belong; steps are logged if that was asked."""
+    silence(voice.quiet)
+    log, handler, start = logging.getLogger("torchkcreg"), logging.StreamHandler(), time.perf_counter()
+    handler.format = lambda record: f"{name}: {time.perf_counter() - start:7.1f} s  {record.getMessage()}"  # type: ignore[method-assign]
+    level = log.level
+    if voice.verbose:
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
+    aside = sys.stderr if voice.json else io.StringIO()
+    try:
+        with contextlib.redirect_stdout(aside) if voice.json or voice.quiet else contextlib.nullcontext():
+            yield
+        log.info("done")
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+        silence(False)
 
 
 def one_line(message: object) -> str:

@@ -87,6 +87,20 @@ def test_a_known_spectrum_is_where_it_starts(scans):
     assert found.in_words()["alloys"] == ("titanium",)
 
 
+def through_water(beam: BeamModel, mm: float = 45.0) -> float:
+    """The line integral that the beam has behind so much water."""
+    return float(-(beam.weights * torch.exp(-beam.background * beam.water * mm)).sum().log())
+
+
+@pytest.mark.parametrize(("alloy", "kvp"), [("titanium", 120.0), ("steel", 80.0)])
+def test_that_the_object_is_a_water_bath_fixes_the_scale(scans, alloy, kvp):
+    truth = through_water(BeamModel.polyenergetic([material(alloy)], tungsten_spectrum(kvp)))
+    found = estimate_beam(scans[alloy, kvp], GEOMETRY, GRID, [component(alloy)], soft_tissue=1.0)
+    assert through_water(found.beam) == pytest.approx(truth, rel=0.01)
+    muscle = estimate_beam(scans[alloy, kvp], GEOMETRY, GRID, [component(alloy)], soft_tissue=1.05)
+    assert through_water(muscle.beam) < 0.97 * through_water(found.beam)  # water lets through more than muscle
+
+
 def test_a_figure_shows_the_curve_and_the_pixels(scans):
     found = estimate_beam(scans["steel", 80.0], GEOMETRY, GRID, [component("steel")])
     axes = beam_figure(found.beam.beam, found.alloys, found.lengths_mm, found.measured).axes[0]

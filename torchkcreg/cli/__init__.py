@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import NoReturn
 
 import torchkcreg
-from torchkcreg.console import one_line, run_command
+from torchkcreg.console import Answer, one_line, run_command
 
-from .command import add_command
+from .command import add_command, voice_of
 from .compare import add_compare
+from .completion import add_completion
 from .convert import add_convert
 from .densitometry import add_densitometry
 from .doctor import add_doctor
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
     except SystemExit as done:  # argparse is done after --help, --version, or a wrong flag
         return int(done.code or 0)
-    return run_command(f"torchkcreg {options.command}", lambda: options.run(options), debug=options.debug)
+    return run_command(f"torchkcreg {options.command}", lambda: options.run(options), voice_of(options))
 
 
 class _Parser(argparse.ArgumentParser):
@@ -70,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_reconstruct(commands)
     _add_info(commands)
     add_doctor(commands)
+    add_completion(commands, _parser)
     _add_demo(commands)
     return parser
 
@@ -84,7 +86,7 @@ def _add_warp(commands) -> None:
     command.add_argument("--implant-name", help="of several implants, the one whose frame the points are in (its file)")
 
 
-def _warp(options: argparse.Namespace) -> None:
+def _warp(options: argparse.Namespace) -> Answer:
     from torchkcreg.io import read_points, read_run, write_points
 
     result, points = read_run(options.run_folder), read_points(options.points)
@@ -103,6 +105,7 @@ def _warp(options: argparse.Namespace) -> None:
     if implant.deviations is not None:
         columns |= dict(zip(("lateral_std_mm", "depth_std_mm"), implant.deviations.split(points), strict=True))
     write_points(options.out, implant.warp(points), **columns)
+    return Answer("", {"out": options.out, "points": len(points), "outside": int(outside.sum())})
 
 
 def _add_evaluate(commands) -> None:
@@ -120,15 +123,15 @@ def _add_evaluate(commands) -> None:
     command.add_argument("--figures", type=Path, help="folder for displacement map, error map and histogram (PNG)")
 
 
-def _evaluate(options: argparse.Namespace) -> None:
+def _evaluate(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import evaluate_files
     from torchkcreg.io import write_json
 
     names = ("points", "truth", "reference", "reference_kind", "implant", "figures")
     found = evaluate_files(options.run_folder, **{name: getattr(options, name) for name in names})
-    print(found)
     if options.out:
         write_json(options.out, found.to_dict())
+    return Answer(str(found), found.to_dict())
 
 
 def _add_reconstruct(commands) -> None:
@@ -167,6 +170,8 @@ def _add_reconstruct(commands) -> None:
     command.add_argument("--stream", action="store_true", default=None, help=streamed)
     estimated = "given (default), run (as hard as found), or estimate: where spectrum or alloy are not known"
     command.add_argument("--beam", choices=("given", "run", "estimate"), help=estimated)
+    scale = "attenuation over water of what most of the object is, for --beam estimate: 1 in a water bath"
+    command.add_argument("--soft-tissue", type=float, metavar="SHARE", help=scale)
     command.add_argument("--material", help="of the implant, where the registration had none")
     alone = "the object is of this material alone, such as an implant on a bench: fdk gives its share in each voxel"
     command.add_argument("--single-material", metavar="NAME", help=alone)
@@ -176,7 +181,7 @@ def _add_reconstruct(commands) -> None:
     existing.add_argument("--resume", action="store_true", help="continue the one that the folder holds")
 
 
-def _reconstruct(options: argparse.Namespace) -> None:
+def _reconstruct(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import ReconstructionFiles, ReconstructionOptions, reconstruct_files, resolve_options
 
     names = ("geometry", "projections", "spectrum", "components", "open_beam", "initial")
@@ -192,7 +197,8 @@ def _reconstruct(options: argparse.Namespace) -> None:
         figures=not options.no_figures,
     )
     depth, height, width = metrics["shape"]
-    print(f"{width} x {height} x {depth} voxels in {metrics['seconds']:.0f} s; folder {options.out}")
+    text = f"{width} x {height} x {depth} voxels in {metrics['seconds']:.0f} s; folder {options.out}"
+    return Answer(text, {**metrics, "folder": options.out})
 
 
 def _add_info(commands) -> None:
@@ -201,15 +207,14 @@ def _add_info(commands) -> None:
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, where projections do not say it")
 
 
-def _info(options: argparse.Namespace) -> None:
+def _info(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import describe, describe_installation, runs_compared
 
-    if not options.paths:
-        print(describe_installation())
-    for path in options.paths:
-        print(describe(path, open_beam=options.open_beam))
+    told = {str(path): describe(path, open_beam=options.open_beam) for path in options.paths}
+    texts = list(told.values()) or [describe_installation()]
     if compared := runs_compared(options.paths):
-        print(compared)
+        texts.append(compared)
+    return Answer("\n".join(texts), {"files": told} if told else {"installation": texts[0].splitlines()})
 
 
 def _add_demo(commands) -> None:
@@ -219,7 +224,8 @@ def _add_demo(commands) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace the demo that the folder holds")
 
 
-def _demo(options: argparse.Namespace) -> None:
+def _demo(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import demo
 
     demo(options.out, seed=options.seed, overwrite=options.overwrite)
+    return Answer("", {"folder": options.out})

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -23,7 +25,7 @@ def add_compare(commands) -> None:
     command.add_argument("--no-figures", action="store_true", help="leave the picture out")
 
 
-def _compare(options: argparse.Namespace) -> None:
+def _compare(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import compare_files
 
     found = compare_files(
@@ -36,4 +38,4 @@ def _compare(options: argparse.Namespace) -> None:
         name=options.implant_name,
         figures=not options.no_figures,
     )
-    print(found)
+    return Answer(str(found), found.to_dict())

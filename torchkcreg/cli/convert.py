@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -26,18 +28,17 @@ def add_convert(commands) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace the target")
 
 
-def _convert(options: argparse.Namespace) -> None:
+def _convert(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import convert_geometry
 
-    print(
-        convert_geometry(
-            options.source,
-            options.target,
-            projections=options.projections,
-            det_shape=None if options.rows is None or options.cols is None else (options.rows, options.cols),
-            pixel_spacing=options.pixel_pitch,
-            layout=options.layout,
-            gantry_axis=options.gantry_axis,
-            overwrite=options.overwrite,
-        )
+    said = convert_geometry(
+        options.source,
+        options.target,
+        projections=options.projections,
+        det_shape=None if options.rows is None or options.cols is None else (options.rows, options.cols),
+        pixel_spacing=options.pixel_pitch,
+        layout=options.layout,
+        gantry_axis=options.gantry_axis,
+        overwrite=options.overwrite,
     )
+    return Answer(said, {"target": options.target, "said": said})

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -23,7 +25,7 @@ def add_densitometry(commands) -> None:
     command.add_argument("--no-figures", action="store_true", help="leave the picture out")
 
 
-def _densitometry(options: argparse.Namespace) -> None:
+def _densitometry(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import densitometry_files
 
     found = densitometry_files(
@@ -34,8 +36,9 @@ def _densitometry(options: argparse.Namespace) -> None:
         from_metal_mm=options.from_metal,
         figures=not options.no_figures,
     )
-    print(f"{'region':12} {'mL':>8} {'calcium':>10} {'std':>7} {'HA':>8}  mg/mL")
+    lines = [f"{'region':12} {'mL':>8} {'calcium':>10} {'std':>7} {'HA':>8}  mg/mL"]
     for one in found:
         text = f"{one.name:12} {one.volume_ml:8.3f} {one.calcium_mg_ml:10.1f} {one.std_mg_ml:7.1f}"
         left = f"  ({100 * one.left_out:.0f} % too near to metal)" if one.left_out else ""
-        print(f"{text} {one.hydroxyapatite_mg_ml:8.1f}{left}")
+        lines.append(f"{text} {one.hydroxyapatite_mg_ml:8.1f}{left}")
+    return Answer("\n".join(lines), {"regions": [vars(one) for one in found]})

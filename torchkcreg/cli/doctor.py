@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 UNHEALTHY = 1
@@ -15,9 +17,8 @@ def add_doctor(commands) -> None:
     add_command(commands, "doctor", _doctor, text)
 
 
-def _doctor(options: argparse.Namespace) -> int:
+def _doctor(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import doctor
 
     text, healthy = doctor()
-    print(text)
-    return 0 if healthy else UNHEALTHY
+    return Answer(text, {"healthy": healthy, "lines": text.splitlines()}, 0 if healthy else UNHEALTHY)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -22,9 +24,10 @@ def add_experiment(commands) -> None:
     command.add_argument("--out", type=Path, help="folder to make, or to go on with (default: NAME)")
 
 
-def _experiment(options: argparse.Namespace) -> None:
+def _experiment(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments.paper import femoral_plate, tibial_plate
 
     run = {"tibial-plate": tibial_plate, "femoral-plate": femoral_plate}[options.name]
     out = options.out or Path(options.name)
-    print(f"\n{run(out, quick=options.quick, known=not options.blind, paper=options.paper)}\n\nfolder {out}")
+    table = run(out, quick=options.quick, known=not options.blind, paper=options.paper)
+    return Answer(f"\n{table}\n\nfolder {out}", {"folder": out, "table": table})

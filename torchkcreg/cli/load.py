@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -21,7 +23,7 @@ def add_load(commands) -> None:
     command.add_argument("--no-figures", action="store_true", help="leave the picture out")
 
 
-def _load(options: argparse.Namespace) -> None:
+def _load(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import load_files
 
     found = load_files(
@@ -32,4 +34,4 @@ def _load(options: argparse.Namespace) -> None:
         name=options.implant_name,
         figures=not options.no_figures,
     )
-    print(found)
+    return Answer(str(found), found.to_dict())

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -24,9 +26,10 @@ def add_plan(commands) -> None:
     command.add_argument("--no-figures", action="store_true", help="leave the picture out")
 
 
-def _plan(options: argparse.Namespace) -> None:
+def _plan(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import plan_files
 
     names = ("material", "components", "spectrum", "init", "every", "most")
     given = {name: getattr(options, name) for name in names}
-    print(plan_files(options.implant, options.geometry, options.out, **given, figures=not options.no_figures))
+    found = plan_files(options.implant, options.geometry, options.out, **given, figures=not options.no_figures)
+    return Answer(str(found), found.to_dict())

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 FAILED = 3  # exit status
@@ -15,8 +17,15 @@ def add_register(commands) -> None:
     command = add_command(commands, "register", _register, "measure the deformation of an implant in a few projections")
     mesh = "closed mesh of the undeformed implant (mm); repeated, with --components, --init and --material, for several"
     command.add_argument("--implant", type=Path, action="append", required=True, help=mesh)
-    command.add_argument("--geometry", type=Path, required=True, help="projection matrices (JSON, XML, NPY, CSV, DICOM)")
-    command.add_argument("--projections", type=Path, required=True, help="intensities or line integrals (NPZ, MHA, TIFF, a folder, YAML, ...)")
+    command.add_argument(
+        "--geometry", type=Path, required=True, help="projection matrices (JSON, XML, NPY, CSV, DICOM)"
+    )
+    command.add_argument(
+        "--projections",
+        type=Path,
+        required=True,
+        help="intensities or line integrals (NPZ, MHA, TIFF, a folder, YAML, ...)",
+    )
     command.add_argument("--out", type=Path, required=True, help="run folder to make")
     command.add_argument("--views", type=_integers, help="views to use, such as 15,16,17 (default: all)")
     steel = "material of the implant, such as steel: polyenergetic DRRs"
@@ -64,7 +73,7 @@ def _integers(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(f"views must be integers separated by commas, got {text!r}") from None
 
 
-def _register(options: argparse.Namespace) -> int:
+def _register(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import RegistrationFiles, dry_run, register_files, register_seeds
 
     if options.seeds is not None and options.resume:
@@ -78,15 +87,17 @@ def _register(options: argparse.Namespace) -> int:
     overrides |= {"material": options.material[0]} if options.material else {}
     if options.dry_run:
         picture = None if options.no_figures else options.out.with_name(f"{options.out.name}-start.png")
-        print("\n".join(dry_run(files, picture, overrides=overrides)))
-        return 0
+        lines = dry_run(files, picture, overrides=overrides)
+        return Answer("\n".join(lines), {"said": lines, "picture": picture})
+    said = ""
     how = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}
     if options.seeds is not None:
         runs = register_seeds(files, options.out, options.seeds, **how)
         result = runs.result
-        print(runs)
+        said = f"{runs}\n"
     else:
         result = register_files(files, options.out, resume=options.resume, **how)
     similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())
-    print(f"{result.status}: gradient correlation of each view {similarity}; run folder {options.out}")
-    return FAILED if result.status == "failed" else 0
+    said += f"{result.status}: gradient correlation of each view {similarity}; run folder {options.out}"
+    data = {"folder": options.out, "status": result.status, "reasons": result.warnings, "gc": result.gc.tolist()}
+    return Answer(said, data, FAILED if result.status == "failed" else 0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -16,7 +18,8 @@ def add_report(commands) -> None:
     command.add_argument("--out", type=Path, help="page to write (default: FOLDER/report.html)")
 
 
-def _report(options: argparse.Namespace) -> None:
+def _report(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import write_report
 
-    print(write_report(options.folder, out=options.out))
+    page = write_report(options.folder, out=options.out)
+    return Answer(str(page), {"page": page})

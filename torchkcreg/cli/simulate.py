@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -18,7 +20,8 @@ def add_simulate(commands) -> None:
     command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
 
 
-def _simulate(options: argparse.Namespace) -> None:
+def _simulate(options: argparse.Namespace) -> Answer:
     from torchkcreg.experiments import simulate_files
 
-    print(simulate_files(options.recipe, options.out, overwrite=options.overwrite, figures=not options.no_figures))
+    found = simulate_files(options.recipe, options.out, overwrite=options.overwrite, figures=not options.no_figures)
+    return Answer(str(found), vars(found))

@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from torchkcreg.console import Answer
+
 from .command import add_command
 
 
@@ -41,11 +43,11 @@ def _options(text: str) -> dict[str, Any]:
     return found
 
 
-def _study(options: argparse.Namespace) -> None:
+def _study(options: argparse.Namespace) -> Answer:
     from torchkcreg.studies import StudyOptions, run_study
 
     names = ("cases", "first", "views", "known", "elastic", "images", "options", "cache")
     given = StudyOptions(**{name: getattr(options, name) for name in names})
     out = options.out or Path(f"study-{options.name}")
-    print(run_study(options.name, given, out, workers=options.workers, cluster=options.cluster)[1])
-    print(f"folder {out}")
+    rows, text = run_study(options.name, given, out, workers=options.workers, cluster=options.cluster)
+    return Answer(f"{text}\nfolder {out}", {"folder": out, "rows": rows})

@@ -1,22 +1,38 @@
-"""What a file or a run folder holds, and what is installed, in a few lines for people."""
+"""What a file or a folder holds, and what is installed, in a few lines for people."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from torchkcreg.deformation import FiniteElementDeformation, FreeFormDeformation
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.implant import volume
-from torchkcreg.io import RunFolder, geometry_from_dict, read_json, read_mesh, read_projections, versions
+from torchkcreg.io import (
+    geometry_from_dict,
+    read_components,
+    read_config,
+    read_geometry,
+    read_init,
+    read_json,
+    read_mesh,
+    read_points,
+    read_projections,
+    read_rtk,
+    read_spectrum,
+    read_volume,
+    versions,
+)
 from torchkcreg.kernels import PACKAGE, choose_backend, unavailable_reason
-from torchkcreg.registration import RegisteredImplant
+
+from .describe_run import describe_run
 
 _MESHES = (".stl", ".obj", ".ply", ".off", ".3mf")
-_IMAGES = (".npz", ".npy", ".mha", ".mhd", ".nrrd", ".nii", ".gz", ".tif", ".tiff")
+_VOLUMES = (".mha", ".mhd", ".nrrd", ".nii", ".gz")
+_STACKS = (".tif", ".tiff", ".png", ".h5", ".hdf5", ".hdf", ".nxs")
 
 
 def describe_installation() -> str:
@@ -36,31 +52,45 @@ def kernels_in_words() -> tuple[str, str]:
 
 
 def describe(path: Path, *, open_beam: float | None = None) -> str:
-    """What a mesh, a geometry, projections or a run folder holds.
+    """What a mesh, a geometry, projections, a table, a configuration, a volume or a folder of results holds.
 
     Args:
-        path: A run folder, a mesh (STL, OBJ, PLY, OFF, 3MF), a geometry (JSON) or projections (NPZ, NPY, MHA, ...).
+        path: A folder (a run, a reconstruction, a comparison, images), or a file of any kind that is read or written.
         open_beam: Unattenuated intensity, where projections do not say it.
 
     Raises:
         FileNotFoundError: If nothing is there, or the run in the folder is not finished.
         ValueError: If it cannot be read, or is none of these.
     """
-    path = Path(path)
-    readers: dict[tuple[str, ...], Callable[[Path], str]] = {
-        _MESHES: _mesh,
-        (".json",): _geometry,
-        _IMAGES: partial(_projections, open_beam=open_beam),
+    path, projections = Path(path), partial(_projections, open_beam=open_beam)
+    readers: dict[tuple[str, ...], list[Callable[[Path], str]]] = {
+        _MESHES: [_mesh],
+        (".json",): [_json],
+        (".xml",): [_rtk],
+        (".csv", ".txt"): [_spectrum, _points, _matrices],
+        (".npz", ".npy"): [_matrices, projections],
+        _VOLUMES: [projections, _volume],
+        _STACKS: [projections],
+        (".dcm", ".ima"): [_dicom, projections],
+        (".yaml", ".yml"): [partial(_yaml, open_beam=open_beam)],
     }
     if path.is_dir():
-        return f"{path}: {_run(path)}"
+        return f"{path}: {_folder(path, open_beam)}"
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
-    for suffixes, read in readers.items():
+    for suffixes, candidates in readers.items():
         if path.suffix.lower() in suffixes:
-            return f"{path}: {read(path)}"
+            return f"{path}: {_first(path, candidates)}"
     known = ", ".join(suffix for suffixes in readers for suffix in suffixes)
-    raise ValueError(f"{path} is none of what can be described: a run folder, or a file ending in {known}")
+    raise ValueError(f"{path} is none of what can be described: a folder of results, or a file ending in {known}")
+
+
+def _first(path: Path, candidates: list[Callable[[Path], str]]) -> str:
+    """What the first says that can read a file; what the last finds wrong with it if none can."""
+    for read in candidates[:-1]:
+        with contextlib.suppress(ValueError):
+            return read(path)
+    return candidates[-1](path)
 
 
 def _mesh(path: Path) -> str:
@@ -71,22 +101,92 @@ def _mesh(path: Path) -> str:
     return f"closed mesh, {len(mesh.faces)} triangles, {size} mm about ({center}), volume {volume(mesh):.6g} mm^3"
 
 
-def _geometry(path: Path) -> str:
-    content = read_json(path, "geometry")
-    if not isinstance(content, dict) or "views" not in content:
-        raise ValueError(f"{path} is no geometry: it has no 'views'")
-    try:
-        geometry = geometry_from_dict(content)
-    except ValueError as error:
-        raise ValueError(f"geometry file {path}: {error}") from error
+def _json(path: Path) -> str:
+    content = read_json(path, "JSON")
+    keys = content.keys() if isinstance(content, dict) else {}
+    if "screws" in keys:
+        screws = read_components(path)
+        materials = ", ".join(sorted({screw.material for screw in screws}))
+        return f"screws, {len(screws)} of {materials}"
+    if "implant_to_world" in keys:
+        shift = ", ".join(f"{x:.4g}" for x in read_init(path)[:3, 3].tolist())
+        return f"initial pose, shifts the implant's origin to ({shift}) mm"
+    if "views" in keys:
+        try:
+            return _geometry(geometry_from_dict(content))
+        except ValueError as error:
+            raise ValueError(f"geometry file {path}: {error}") from error
+    return f"JSON with {', '.join(sorted(map(str, keys))) or 'no keys'}: neither geometry, nor screws, nor initial pose"
+
+
+def _rtk(path: Path) -> str:
+    return _geometry(
+        read_rtk(path, det_shape=(1, 1), pixel_spacing=(1.0, 1.0)), "RTK's geometry (pixels are the images')"
+    )
+
+
+def _matrices(path: Path) -> str:
+    return _geometry(
+        read_geometry(path, det_shape=(1, 1), pixel_spacing=(1.0, 1.0), layout="matrices"),
+        "3 x 4 matrices (pixels are the images')",
+    )
+
+
+def _dicom(path: Path) -> str:
+    return _geometry(read_geometry(path))
+
+
+def _geometry(geometry: ConeBeamGeometry, what: str = "") -> str:
     rows, cols = geometry.det_shape
     dv, du = geometry.pixel_spacing
     distances = geometry.detector_distances
-    head = (
+    head = what or (
         f"geometry, {geometry.num_views} views of {rows} x {cols} pixels ({dv:.4g} x {du:.4g} mm), source to detector "
         f"{_range(distances.min().item(), distances.max().item())} mm"
     )
     return "\n".join([head, *(f"  view {i}: {_view(geometry, i)}" for i in range(geometry.num_views))])
+
+
+def _spectrum(path: Path) -> str:
+    spectrum = read_spectrum(path)
+    low, high = min(spectrum.energies_kev), max(spectrum.energies_kev)
+    number, mean = len(spectrum.weights), spectrum.mean_energy
+    return f"spectrum, {number} energies from {low:g} to {high:g} keV, mean {mean:.1f} keV"
+
+
+def _points(path: Path) -> str:
+    points = read_points(path)
+    low, high = points.amin(0).tolist(), points.amax(0).tolist()
+    spans = " ".join(f"{name} {a:.4g} to {b:.4g}" for name, a, b in zip("xyz", low, high, strict=True))
+    return f"points, {len(points)}: {spans} mm"
+
+
+def _volume(path: Path) -> str:
+    values, grid = read_volume(path)
+    size = " x ".join(str(n) for n in reversed(grid.shape))
+    spacing = " x ".join(f"{step:.4g}" for step in reversed(grid.spacing))
+    return f"volume, {size} voxels of {spacing} mm, values {values.min():.4g} to {values.max():.4g}"
+
+
+def _yaml(path: Path, *, open_beam: float | None) -> str:
+    content = read_config(path)
+    if "images" in content:
+        return _projections(path, open_beam=open_beam)
+    return f"configuration with {', '.join(content) or 'nothing'}"
+
+
+def _folder(path: Path, open_beam: float | None) -> str:
+    if (path / "deformation.json").exists() or ((path / "config.yaml").exists() and not (path / "volume.mha").exists()):
+        return describe_run(path)
+    if (path / "volume.mha").exists():
+        return "reconstruction; volume.mha is a " + _volume(path / "volume.mha")
+    for name, what in (("compare.json", "comparison"), ("load.json", "loads"), ("plan.json", "plan of views")):
+        if (path / name).exists():
+            return f"{what}, in {name}"
+    try:
+        return _projections(path, open_beam=open_beam)
+    except ValueError as error:
+        raise FileNotFoundError(f"{path} holds neither results nor a scan: {error}") from error
 
 
 def _view(geometry: ConeBeamGeometry, view: int) -> str:
@@ -108,37 +208,3 @@ def _projections(path: Path, *, open_beam: float | None) -> str:
     masked = [f"{count} pixels masked ({reason})" for reason, count in projections.num_masked.items()]
     saturated = [f"{projections.num_saturated} saturated"] if projections.num_saturated else []
     return ", ".join([f"projections, {views} views of {rows} x {cols} pixels", span, *masked, *saturated])
-
-
-def _run(path: Path) -> str:
-    run = RunFolder(path)
-    result = run.read_result()
-    metrics = read_json(path / "metrics.json", "metrics") if (path / "metrics.json").is_file() else {}
-    sizes = "; ".join(_size(implant) for implant in result.implants)
-    lines = [
-        f"run, {result.status}, {sizes}, {len(result.history)} iterations",
-        "  gradient correlation of each view: " + " ".join(f"{gc:.3f}" for gc in result.gc.tolist()),
-    ]
-    if isinstance(metrics.get("node_std_mm"), float):
-        lines.append(f"  expected error of the nodes: {metrics['node_std_mm']:.3f} mm (RMS)")
-    if {"mean_motion_mm", "largest_motion_mm"} <= metrics.keys():
-        lines.append(
-            f"  motion of the nodes: mean {metrics['mean_motion_mm']:.3f} mm, largest "
-            f"{metrics['largest_motion_mm']:.3f} mm"
-        )
-    if isinstance(metrics.get("seconds"), (int, float)):
-        lines.append(f"  took {metrics['seconds']:.0f} s")
-    lines += [f"  {name}: {value:.3g}" for name, value in result.intensity.items()]
-    return "\n".join([*lines, *(f"  warning: {text}" for text in result.warnings)])
-
-
-def _size(implant: RegisteredImplant) -> str:
-    deformation = implant.deformation
-    if isinstance(deformation, FiniteElementDeformation):
-        element = deformation.superelement
-        return f"{implant.name}: elastic body held at {len(element.holds)} places, {element.num_amounts} ways to bend"
-    if not isinstance(deformation, FreeFormDeformation):
-        return f"{implant.name}: {deformation.model} deformation"
-    shape = " x ".join(str(n) for n in deformation.grid.shape)
-    groups = deformation.num_groups
-    return f"{implant.name}: {shape} control points in {groups} group{'s' * (groups > 1)}"

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from torchkcreg.physics import material
+from torchkcreg.progress import progress_bar
 from torchkcreg.reconstruction import BeamModel, component_path_lengths, inpainted, path_lengths_through, prepare
 
 from .reconstruction_inputs import ReconstructionInputs
@@ -30,7 +30,7 @@ def line_integrals(inputs: ReconstructionInputs, options: ReconstructionOptions)
 
 def streamed(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Callable[[list[int]], Tensor]:
     """The same of views as they are asked for, with a bar that shows how many there were."""
-    bar = tqdm(total=inputs.geometry.num_views, desc="views", disable=None)
+    bar = progress_bar(total=inputs.geometry.num_views, desc="views")
 
     def read(views: list[int]) -> Tensor:
         lines = line_integrals(inputs.of_views(views), options)

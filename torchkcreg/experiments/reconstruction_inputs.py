@@ -117,6 +117,8 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         )
     if options.refine > 1 and options.method != "kcrec":
         raise ValueError(f"voxels are divided near known metal, which kcrec has, not {options.method}")
+    if options.soft_tissue is not None and options.beam != "estimate":
+        raise ValueError("soft tissue fixes the scale of an estimated beam: it goes with beam estimate")
     if options.beam != "given" and options.monoenergetic:
         raise ValueError(f"a beam of one energy is never that of beam {options.beam}: leave one of the two out")
     spectrum = read_spectrum(files.spectrum) if files.spectrum is not None else None
@@ -147,6 +149,7 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
                 scatter=scatter,
                 mask=projections.mask,
                 alloys=alloys,
+                soft_tissue=options.soft_tissue,
                 backend=options.backend,
             )
 

@@ -58,6 +58,8 @@ class ReconstructionOptions(Config):
         beam: "given" is the spectrum of the file and the materials of the run, or a likely one; "run" is the same, as
             hard as the registration found it; "estimate" is what the
             metal's shadow tells of a spectrum, or an implant's material, that nobody knows (methods with components).
+        soft_tissue: Attenuation over water of what most of the object is, where an estimated beam may rest on that: 1
+            in a water bath.
         stream: Views are read some at a time, of scans that are larger than memory; iterative methods keep what they
             make of them in files in the folder, for as long as they run.
         material: The implant's, where the registration had none.
@@ -82,6 +84,7 @@ class ReconstructionOptions(Config):
     scatter_sigma_mm: float = Field(40.0, gt=0)
     monoenergetic: bool = False
     beam: Literal["given", "run", "estimate"] = "given"
+    soft_tissue: float | None = Field(None, gt=0.5, lt=2)
     stream: bool = False
     material: str | None = None
     single_material: str | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from torchkcreg.io.image_series import open_series
 from torchkcreg.io.measured import Projections, converted
 from torchkcreg.io.plausible import ImageHeader, implausible_images
 
+log = logging.getLogger(__name__)
 _ARRAYS = ("intensity", "open_beam", "line_integrals", "mask", "saturation", "dark")
 
 
@@ -62,6 +64,7 @@ def read_projections(
         doubts = implausible_images(projections.line_integrals, projections.mask)
     except ValueError as error:
         raise ValueError(f"projections file {path}: {error}") from error
+    log.info("projections %s: %d views of %d x %d pixels", path, *projections.line_integrals.shape)
     for doubt in doubts:
         warnings.warn(f"projections file {path}: {doubt}", stacklevel=2)
     return replace(projections, header=header)

@@ -33,6 +33,7 @@ SCALE = 0.03  # of an alloy's attenuation
 UNLIKELY = 3.0  # so many of these are told
 SCATTER = 0.05  # of the scatter that was fitted to the air
 TISSUE = 0.02  # of the attenuation of the soft tissue that most of an object is, beside water
+KNOWN_TISSUE = 0.003  # of the same, where it is known
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ def estimate_beam(
     scatter: Veil | Tensor | None = None,
     mask: Tensor | None = None,
     alloys: Sequence[str] = (),
+    soft_tissue: float | None = None,
     backend: str = "auto",
 ) -> BeamEstimate:
     """The beam, and the metals' attenuation in it, that explain what known metal lets through.
@@ -98,6 +100,8 @@ def estimate_beam(
         scatter: See `prepare`.
         mask: 0 where a pixel holds no measurement.
         alloys: Names of materials that any of the components may be of; without, each is of its own.
+        soft_tissue: Attenuation over water of what most of the object is, where that is known: 1 in a water bath. It
+            fixes the scale of all attenuation, which the metal's shadow leaves free within a per cent or two.
         backend: Of the projectors.
 
     Raises:
@@ -114,7 +118,7 @@ def estimate_beam(
     shadow = metal_shadow(transmission - veil, veil, metal, unknown, geometry, grid, start, mask, backend)
     spectra = {None: spectrum} if spectrum is not None else {kvp: tungsten_spectrum(kvp) for kvp in TUBE_KVP}
     metals = list(itertools.product(*(dict.fromkeys([name, *alloys]) for name in known_materials(components))))
-    fits = [_fitted(shadow, one, kvp, names) for kvp, one in spectra.items() for names in metals]
+    fits = [_fitted(shadow, one, kvp, names, soft_tissue) for kvp, one in spectra.items() for names in metals]
     best = min(fits, key=lambda fit: fit.cost)
     for doubt in _doubts(best, shadow):
         warnings.warn(f"the estimated beam is doubtful: {doubt}", stacklevel=2)
@@ -134,7 +138,9 @@ def _doubts(found: BeamEstimate, shadow: MetalShadow) -> list[str]:
     return doubts
 
 
-def _fitted(shadow: MetalShadow, spectrum: Spectrum, kvp: float | None, metals: Sequence[str]) -> BeamEstimate:
+def _fitted(
+    shadow: MetalShadow, spectrum: Spectrum, kvp: float | None, metals: Sequence[str], soft_tissue: float | None
+) -> BeamEstimate:
     """The hardness and scales that explain the shadow best."""
     water, reference_kev = material("water"), float(shadow.start.reference_kev or 0)
     whole = Beam.of([*(material(name) for name in metals), water], spectrum, num_bins=NUM_BINS)
@@ -159,13 +165,15 @@ def _fitted(shadow: MetalShadow, spectrum: Spectrum, kvp: float | None, metals: 
     knows_tissue, start = not math.isnan(shadow.tissue), shadow.start
     own = _corrected(start.weights.numpy(), start.background.numpy(), shadow.typical) if knows_tissue else 1.0
 
+    likely, spread = (1.0, TISSUE) if soft_tissue is None else (soft_tissue, KNOWN_TISSUE)
+
     def tissue(x: np.ndarray) -> float:
         """Its attenuation over water, whose logarithm changes with the beam as a typical line integral's does."""
-        return shadow.tissue * _corrected(shares(x[0]), ratio, shadow.typical) / own if knows_tissue else 1.0
+        return shadow.tissue * _corrected(shares(x[0]), ratio, shadow.typical) / own if knows_tissue else likely
 
     def misfit(x: np.ndarray) -> np.ndarray:
         data = left(x) * math.sqrt(min(1.0, INDEPENDENT / len(primary)))
-        prior = [x[0] / HARDNESS_MM, x[1] / SCATTER, math.log(tissue(x)) / TISSUE]
+        prior = [x[0] / HARDNESS_MM, x[1] / SCATTER, math.log(tissue(x) / likely) / spread]
         return np.concatenate([data, prior, (x[2:] - 1) / SCALE])
 
     fit = least_squares(misfit, np.concatenate([[0.0, 0.0], np.ones(len(metals))]))

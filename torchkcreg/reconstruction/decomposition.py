@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.physics import Spectrum, Veil, calcium_attenuation, calcium_of, material
+from torchkcreg.progress import progress_bar
 from torchkcreg.scene import KnownComponent
 
 from .corrections import floored_line_integrals, scatter_image
@@ -103,8 +103,8 @@ def decompose(
     start = _one_attenuation(system, lines, weights, sources, unknown, config, grid)
     water, calcium = _split(start, sources[0].beam, unknown)
     solver = TwoMaterials(system, lines, weights, sources, unknown, config, grid.spacing, torch.stack([water, calcium]))
-    disable = None if progress is None else not progress
-    history = [solver.iterate() for _ in tqdm(range(config.iterations), desc="water and calcium", disable=disable)]
+    steps = progress_bar(range(config.iterations), desc="water and calcium", shown=progress)
+    history = [solver.iterate() for _ in steps]
     return Decomposition(solver.x[0], solver.x[1] * CALCIUM_UNIT, calcium_of(start, reference), unknown, history)
 
 

@@ -25,6 +25,7 @@ STEEPEST = 0.15  # change of the metal's length to the next pixel, as a share: r
 LEAST_TRANSMISSION = 0.003  # below it nothing is left of the beam that tells anything
 BACKGROUND = 0.03  # of a line integral: the interpolated background's error
 NOISE = 2e-3  # of a transmission
+NEAR_MODE = 0.06  # of water: what is taken for the same tissue
 TISSUE_RANGE = (0.85, 1.15)  # of water: what most of an object is beyond that is no soft tissue
 
 
@@ -94,4 +95,7 @@ def _tissue(volume: Tensor, water: float) -> float:
     counts = torch.histc(volume / water, bins=150, min=low, max=high)
     counts = torch.nn.functional.avg_pool1d(counts[None], 5, 1, 2)[0]
     mode = low + (float(counts.argmax()) + 0.5) * (high - low) / len(counts)
-    return mode if TISSUE_RANGE[0] < mode < TISSUE_RANGE[1] else float("nan")
+    if not TISSUE_RANGE[0] < mode < TISSUE_RANGE[1]:
+        return float("nan")
+    share = volume / water
+    return float(share[(share - mode).abs() < NEAR_MODE].median())

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from torchkcreg.callbacks import Callback
+from torchkcreg.progress import progress_bar
 
 from .pwls_config import PWLSConfig
 from .reconstructed import Reconstruction
@@ -190,10 +190,9 @@ class PWLS:
             number: what they are told of this run: its number among several passes.
             progress: show a tqdm bar; None: on a terminal only.
         """
-        disable = None if progress is None else not progress
         for callback in callbacks:
             callback.on_stage_start(self, number, self.config)
-        with tqdm(total=self.config.iterations, initial=self.iteration, desc="PWLS", disable=disable) as bar:
+        with progress_bar(total=self.config.iterations, initial=self.iteration, desc="PWLS", shown=progress) as bar:
             while self.iteration < self.config.iterations:
                 record = self.step()
                 bar.set_postfix(objective=f"{record['objective'] or record['estimate']:.6g}", refresh=False)

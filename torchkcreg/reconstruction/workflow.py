@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,11 +10,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import ConeBeamGeometry, TwoLevelGrid, VolumeGrid
 from torchkcreg.physics import Beam, Veil
+from torchkcreg.progress import progress_bar
 from torchkcreg.scene import KnownComponent
 
 from .corrections import refined_scatter, scatter_image
@@ -27,6 +28,8 @@ from .sharding import ViewShard
 from .spectral import BeamModel, mineral_part, transmitted_behind
 from .system import VoxelSystem
 from .two_levels import TwoLevelRoughness, TwoLevelSystem
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,7 @@ def reconstruct(
     if state is not None:
         start, volume = int(state["pass"]), state["volume"]
     for index in range(start, passes):
+        log.info("pass %d of %d: %d views, %s voxels", index + 1, passes, geometry.num_views, coarse.shape)
         data, scattered = views.prepared(volume if index > 0 else None, space, progress=progress)
         level = grid if index == passes - 1 else coarse
         solver = _solver(system, data, level, config, components, views.unknown, volume, shard)
@@ -162,7 +166,7 @@ class _Views:
         if volume is not None:
             mineral = mineral_part(volume, self.beam, mask=self.unknown)
             seen = None if self.unknown is None else volume * self.unknown
-        bar = tqdm(total=geometry.num_views, desc="views", disable=None if progress is None else not progress)
+        bar = progress_bar(total=geometry.num_views, desc="views", shown=progress)
         for block, share in self.shares():
             views = list(range(geometry.num_views))[block]
             transmission, mask = self.read(views)

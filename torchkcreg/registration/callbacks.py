@@ -8,6 +8,7 @@ from tqdm import tqdm
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import Progress
+from torchkcreg.progress import progress_bar
 from torchkcreg.scene import Scene
 
 from .config import Stage
@@ -38,7 +39,8 @@ class ProgressBar(Callback):
         """Opens the stage's bar."""
         groups = "1 group" if stage.groups == 1 else f"{stage.groups} groups"
         name = f"stage {index + 1}/{len(run.stages)}: {groups}, {stage.optimizer}"
-        self._bar = tqdm(total=stage.iterations, desc=name, disable=self.disable, leave=True)
+        shown = None if self.disable is None else not self.disable
+        self._bar = progress_bar(total=stage.iterations, desc=name, shown=shown)
 
     def on_iteration(self, run: TrainerState, index: int, progress: Progress) -> None:
         """Moves the bar on."""

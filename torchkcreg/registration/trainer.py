@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,6 +20,8 @@ from .result import RegistrationResult
 from .stage_run import StageRun, Step, Terms
 from .steps import AFTER, BEFORE, CHANGE_SCENE
 from .verdict import Rival
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -154,6 +157,11 @@ class Trainer:
         undone = self._guard.after()
         last = optimizer.progress
         self.records.append(StageRecord(last.iteration, optimizer.converged, last.loss, undone))
+        log.info(
+            "stage %d of %d (%d groups, %s): %d iterations, loss %.5f%s",
+            *(index + 1, len(self.stages), stage.groups, stage.optimizer, last.iteration, last.loss),
+            ", undone" if undone else "",
+        )
         self.next_stage, self._run = index + 1, None
         for callback in self.callbacks:
             callback.on_stage_end(self, index, stage)

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from torchkcreg.plain import plain
+from torchkcreg.progress import progress_bar
 
 Job = dict[str, Any]
 Row = dict[str, Any]
@@ -51,7 +51,8 @@ def sweep(
     left = [job for key, job in {_key(job): job for job in jobs}.items() if "error" in kept.get(key, {"error": ""})]
     table.parent.mkdir(parents=True, exist_ok=True)
     with table.open("a", encoding="utf-8") as file:
-        for job, row in tqdm(_made(function, left, workers, cluster), total=len(left), desc=table.stem):
+        rows = _made(function, left, workers, cluster)
+        for job, row in progress_bar(rows, total=len(left), desc=table.stem, shown=True):
             kept[_key(job)] = plain(row)
             file.write(json.dumps({"job": job, "row": plain(row), "version": version}) + "\n")
             file.flush()

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 import trimesh
 from torch import Tensor
-from tqdm import tqdm
 
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
 from torchkcreg.physics import Beam, Spectrum, material
+from torchkcreg.progress import progress_bar
 from torchkcreg.simulation.bench.loaded import ElasticConstruct, Loaded, loaded
 from torchkcreg.simulation.bench.panel import FlatPanel, mean_ratio, scattered
 from torchkcreg.simulation.bench.recipe import Recipe, ScannerRecipe
@@ -138,7 +138,7 @@ def _primaries(
     fine = geometry.refined(factor)
     beam: Beam | None = None
     images = []
-    for matrix in tqdm(fine.projection_matrices, desc=label, disable=label is None):
+    for matrix in progress_bar(fine.projection_matrices, desc=label, shown=label is not None):
         paths = material_paths(parts, matrix.cpu(), fine.det_shape)
         beam = beam or Beam.of([material(name) for name in paths], spectrum, num_bins=None)
         images.append(beam.transmission(torch.stack(list(paths.values()))[None, :, None], pooling=factor)[0, 0])
