@@ -11,6 +11,8 @@ import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
 
+from torchkcreg.io.meta_header import META_SUFFIXES, check_meta_header
+
 _MOST_PACKED = 5000  # how many times larger than its file an image can be: deflate and LZW pack less
 _SMALLEST = 1 << 16  # bytes: what is not worth the question
 _DETACHED = (".mhd", ".nhdr")  # headers whose data are in another file
@@ -84,6 +86,8 @@ def read_image(path: Path, *, first: bool = False) -> sitk.Image:
 
 def _opened(path: Path) -> sitk.ImageFileReader:
     """A reader that has read the header, and believes it."""
+    if path.suffix.lower() in META_SUFFIXES:
+        check_meta_header(path)
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     reader.ReadImageInformation()
