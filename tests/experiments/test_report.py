@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 import torch
 
@@ -39,7 +40,8 @@ def page(run):
 def test_the_verdict_comes_first_and_every_picture_is_inside(run, page):
     result = read_run(run)
     assert page.index(f"<b>{result.status}</b>") < page.index("<table>") < page.index("<img")
-    assert page.count("data:image/png;base64,") == len(list(run.glob("*.png"))) >= 3
+    assert len(list(run.glob("*.png"))) >= 3
+    assert page.count("data:image/png;base64,") == len(list(run.glob("*.png"))) + 2 * 3  # and three views, twice
     for text in result.warnings:
         assert text.split(":")[0].replace("'", "&#x27;") in page
     assert "Registration: a &lt;run&gt;" in page and "a <run>" not in page
@@ -56,6 +58,28 @@ def test_the_scene_has_the_implants_nodes_and_the_registered_views(run, page):
     assert len(scene["points"]) == 3 * min(6000, len(table["x"])) == len(scene["moved"])
     assert max(scene["displacement"]) == pytest.approx(float(table["displacement"].max()), abs=0.05)
     assert len(scene["sources"]) == len(scene["detectors"]) == 3 and len(scene["detectors"][0]) == 4
+
+
+def test_the_views_can_be_laid_over_each_other(run, page):
+    held = np.load(run / "overlay.npz")
+    grey, overlay = held["grey"], held["overlay"]
+    assert overlay.shape == (*grey.shape, 3) and len(held["labels"]) == 3
+    green = overlay[..., 1].astype(int) - overlay[..., 0]
+    assert 0.02 < (green > 30).mean() < 0.6  # the implant, and not all of the view
+    same = green == 0
+    np.testing.assert_allclose(overlay[same][:, 0].astype(int), grey[same], atol=1)
+    for label in held["labels"]:
+        assert f"<option>{label}</option>" in page
+    assert "<option>blink</option>" in page and "<option>checkerboard</option>" in page
+
+
+def test_a_registration_writes_its_page_and_one_without_pictures_none(run):
+    assert "The implant over the measured views" in (run / "report.html").read_text(encoding="utf-8")
+    (run / "overlay.npz").rename(run / "kept.npz")
+    (run / "overlay.npz").write_bytes(b"damaged")
+    page = write_report(run, out=run.parent / "other.html").read_text(encoding="utf-8")
+    (run / "kept.npz").replace(run / "overlay.npz")
+    assert "The implant over the measured views" not in page and "<table>" in page
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.registration import RegisteredImplant, RegistrationResult, Stage, StageRun, similarities
 from torchkcreg.scene import Assembly, RegistrationData, Scene
 from torchkcreg.similarity import GradientCorrelation
-from torchkcreg.visualization import displacement_figure, history_figure, overlay_figure
+from torchkcreg.visualization import displacement_figure, history_figure, overlay_figure, overlay_layers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,6 +52,17 @@ def draw_registration(
         labels = [_stage_label(stage) for stage in result.config.schedule()]
         figures["history.png"] = history_figure(result.history, stage_labels=labels)
     return figures
+
+
+def registered_layers(result: RegistrationResult, data: RegistrationData) -> dict[str, Any]:
+    """Views to lay over each other on a page: "grey", "overlay" (see `overlay_layers`) and "labels"; six at most."""
+    if result.scene is None:
+        raise ValueError("the result has no scene to draw: it was read from files")
+    data = replace(data, geometry=result.corrected(data.geometry))
+    views = _drawn_views(data)
+    shown = data.select(views)
+    grey, overlay = overlay_layers(shown.line_integrals, _drr(_as_told(result.scene), shown))
+    return {"grey": grey, "overlay": overlay, "labels": np.array(_labels(shown.geometry, views))}
 
 
 def _stage_label(stage: Stage) -> str:

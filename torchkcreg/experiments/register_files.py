@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import transform_points
-from torchkcreg.io import RunFolder, read_config, write_geometry
+from torchkcreg.io import LAYERS, RunFolder, read_config, write_geometry, write_layers
 from torchkcreg.registration import (
     Callback,
     Progress,
@@ -26,8 +26,9 @@ from torchkcreg.registration import (
     build_scene,
 )
 
-from .figures import draw_registration
+from .figures import draw_registration, registered_layers
 from .inputs import RegistrationFiles, RegistrationInputs, read_inputs
+from .report_files import write_report
 
 _CHECKPOINT_SECONDS = 5.0
 RECORD_KEYS = {"files", "options", "schedule"}
@@ -131,9 +132,12 @@ def write_run(
     if figures:
         for name, figure in draw_registration(result, trainer.data, starts).items():
             run.write_figure(name, figure)
+        write_layers(run.path / LAYERS, registered_layers(result, trainer.data))
     if result.view_motions is not None:
         write_geometry(run.path / "geometry_corrected.json", result.corrected(trainer.data.geometry))
     run.write_result(result, [implant.cloud.points for implant in inputs.implants], initial_to_world=starts)
+    if figures:
+        write_report(run.path)
 
 
 class _Checkpoints(Callback):

@@ -9,10 +9,18 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, DetectorFrames
-from torchkcreg.io import read_config, read_geometry, read_json, read_point_cloud_ply, write_text
-from torchkcreg.visualization import Page, Row, page_html
+from torchkcreg.io import (
+    LAYERS,
+    REPORT,
+    read_config,
+    read_geometry,
+    read_json,
+    read_layers,
+    read_point_cloud_ply,
+    write_text,
+)
+from torchkcreg.visualization import Page, Row, page_html, png_of
 
-REPORT = "report.html"
 MOST_POINTS = 6000  # of the 3D view
 NAMES = {
     "overlay.png": "Measured views, and the registered implant in them",
@@ -75,6 +83,7 @@ def write_report(folder: Path, *, out: Path | None = None) -> Path:
         warnings=[str(text) for text in metrics.get("warnings") or []],
         rows=rows,
         scene=scene,
+        layers=_layers(folder),
         pictures=pictures,
         details=_details(folder),
         made_with=", ".join(f"{name} {version}" for name, version in versions.items() if isinstance(version, str)),
@@ -171,6 +180,17 @@ def _clouds(folder: Path) -> tuple[Tensor, Tensor, Tensor]:
         moved.append(torch.stack([table.get(f"d{name}", none) for name in "xyz"], dim=-1))
         std.append(table.get("std", none))
     return torch.cat(points), torch.cat(moved), torch.cat(std)
+
+
+def _layers(folder: Path) -> list[tuple[str, bytes, bytes]]:
+    """Label, measured view and view with the implant of each, as PNG."""
+    held = read_layers(folder / LAYERS)
+    if held is None:
+        return []
+    return [
+        (str(label), png_of(grey), png_of(overlay))
+        for label, grey, overlay in zip(held["labels"], held["grey"], held["overlay"], strict=False)
+    ]
 
 
 def _views(folder: Path) -> ConeBeamGeometry | None:

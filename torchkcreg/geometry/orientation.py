@@ -71,7 +71,7 @@ def _meeting_point(matrices: Tensor, det_shape: tuple[int, int]) -> Tensor | Non
     along = along / along.norm(dim=-1, keepdim=True)
     across = torch.eye(3, dtype=matrices.dtype, device=matrices.device) - along[:, :, None] * along[:, None, :]
     mean = across.mean(0)
-    if float(torch.linalg.eigvalsh(mean)[0]) < _LEAST_ANGLE**2:
+    if not bool(mean.isfinite().all()) or float(torch.linalg.eigvalsh(mean)[0]) < _LEAST_ANGLE**2:
         return None
     point = torch.linalg.solve(mean, (across @ sources[:, :, None]).mean(0)).squeeze(-1)
     missed = (across @ (point - sources)[:, :, None]).squeeze(-1).norm(dim=-1)

@@ -10,6 +10,7 @@ from .figures import write_figure
 from .files import read_json, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .init import read_init, write_init
+from .layers import read_layers, write_layers
 from .matrix_tables import read_matrix_table, write_matrix_table
 from .measured import Projections
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
@@ -20,7 +21,7 @@ from .projection_file import ProjectionFile
 from .projections import read_projections, write_projections
 from .references import read_reference
 from .rtk_geometry import read_rtk, write_rtk
-from .runs import RunFolder, read_run
+from .runs import LAYERS, REPORT, RunFolder, read_run
 from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
 from .versions import versions
@@ -28,6 +29,8 @@ from .volumes import read_volume, write_volume
 from .vtu import write_surface_vtu
 
 __all__ = [
+    "LAYERS",
+    "REPORT",
     "ProjectionFile",
     "Projections",
     "RunFolder",
@@ -41,6 +44,7 @@ __all__ = [
     "read_geometry",
     "read_init",
     "read_json",
+    "read_layers",
     "read_matrix_table",
     "read_mesh",
     "read_point_cloud_ply",
@@ -60,6 +64,7 @@ __all__ = [
     "write_init",
     "write_itk_transform",
     "write_json",
+    "write_layers",
     "write_matrix_table",
     "write_mesh",
     "write_point_cloud_ply",

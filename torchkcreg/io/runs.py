@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 CONFIG, VERSIONS, HISTORY, METRICS = "config.yaml", "versions.json", "history.json", "metrics.json"
 DEFORMATION, FIELD, TRANSFORM, CLOUD = "deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply"
 CHECKPOINT, ARRAYS, UNCERTAINTY = "checkpoint.pt", "arrays.npz", "uncertainty.json"
-SEEDS = "seeds"
+SEEDS, LAYERS, REPORT = "seeds", "overlay.npz", "report.html"
 FIGURES = ("overlay.png", "displacement.png", "history.png")
 _RESULT_FILES = (DEFORMATION, METRICS, UNCERTAINTY, FIELD, TRANSFORM, CLOUD, ARRAYS)
-RUN_FILES = (CONFIG, VERSIONS, HISTORY, CHECKPOINT, *_RESULT_FILES, *FIGURES)
+RUN_FILES = (CONFIG, VERSIONS, HISTORY, CHECKPOINT, *_RESULT_FILES, *FIGURES, LAYERS, REPORT)
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
@@ -53,6 +53,7 @@ class RunFolder:
     | `bspline.tfm` | ITK transform, see `itk_transform` |
     | `implant_deformed.ply` | the deformed point cloud with the displacement and the expected error of each node |
     | `overlay.png`, `displacement.png`, `history.png` | figures |
+    | `overlay.npz`, `report.html` | views with and without the implant, and the page that shows them |
     | `seeds/<seed>/` | a run folder of each seed, where several were run |
 
     Use `RunFolder.create` for a new or resumed run and `read_run` for a finished one.

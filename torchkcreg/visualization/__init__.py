@@ -11,8 +11,8 @@ from .displacement import displacement_figure
 from .errors import error_map_figure, histogram_figure
 from .history import history_figure
 from .load import load_figure
-from .overlay import overlay_figure
-from .page import Page, Row, page_html
+from .overlay import overlay_figure, overlay_layers
+from .page import Page, Row, page_html, png_of
 from .plan import plan_figure
 from .reconstruction import reconstruction_figure
 from .series import series_figure
@@ -30,8 +30,10 @@ __all__ = [
     "history_figure",
     "load_figure",
     "overlay_figure",
+    "overlay_layers",
     "page_html",
     "plan_figure",
+    "png_of",
     "reconstruction_figure",
     "series_figure",
 ]

@@ -86,6 +86,26 @@ def overlay_figure(
     return figure
 
 
+def overlay_layers(measured: Tensor, drr: Tensor, *, margin_px: int = 20) -> tuple[NDArray, NDArray]:
+    """What a page shows one over the other: measured views (V, h, w) in grey, and with the DRR in green (V, h, w, 3).
+
+    Both are uint8 and show the implant's surroundings, the same size in each view.
+
+    Args:
+        measured: line integrals (V, rows, cols).
+        drr: DRRs of the registered implant, same shape, any unit.
+        margin_px: pixels kept around the implant.
+    """
+    images, shadows = (tensor.detach().cpu().double().numpy() for tensor in (measured, drr))
+    cut = [
+        (_grey(images[view][window]), shadows[view][window])
+        for view, window in enumerate(_windows([shadows], margin_px))
+    ]
+    grey = np.stack([image[..., 0] for image, _ in cut])
+    green = np.stack([_composite(image, _thickness(shadow)) for image, shadow in cut])
+    return (255 * grey).round().astype(np.uint8), (255 * green).round().clip(0, 255).astype(np.uint8)
+
+
 def _windows(drrs: list[NDArray], margin_px: int) -> list[tuple[slice, slice]]:
     """Rows and columns around the implant in each view, of one size."""
     shadow = np.max([drr > 0.02 * max(drr.max(), 1e-12) for drr in drrs], axis=0)
@@ -106,17 +126,31 @@ def _windows(drrs: list[NDArray], margin_px: int) -> list[tuple[slice, slice]]:
 
 
 def _draw(axes: Axes, image: NDArray, drr: NDArray, aspect: float) -> None:
-    low, high = np.percentile(image, [1.0, 99.5])
-    grey = np.clip((image - low) / max(high - low, 1e-12), 0, 1)[..., None]
-    thickness = np.clip(drr / max(float(np.percentile(drr[drr > 0], 90)) if (drr > 0).any() else 1.0, 1e-12), 0, 1)
-    alpha = _OPACITY * np.sqrt(thickness)[..., None]
-    composite = grey * (1 - alpha) + GREEN * (0.25 + 0.75 * grey) * alpha
-    axes.imshow(composite, origin="upper", aspect=aspect)
+    thickness = _thickness(drr)
+    axes.imshow(_composite(_grey(image), thickness), origin="upper", aspect=aspect)
     if drr.max() > 0:
         axes.contour(thickness, levels=[0.15], colors=[GREEN], linewidths=0.6)
     axes.set(xticks=[], yticks=[])
     for side in axes.spines.values():
         side.set_visible(False)
+
+
+def _grey(image: NDArray) -> NDArray:
+    """Grey levels (h, w, 1) from 0 to 1."""
+    low, high = np.percentile(image, [1.0, 99.5])
+    return np.clip((image - low) / max(high - low, 1e-12), 0, 1)[..., None]
+
+
+def _thickness(drr: NDArray) -> NDArray:
+    """How much metal there is, from 0 to 1."""
+    most = float(np.percentile(drr[drr > 0], 90)) if (drr > 0).any() else 1.0
+    return np.clip(drr / max(most, 1e-12), 0, 1)
+
+
+def _composite(grey: NDArray, thickness: NDArray) -> NDArray:
+    """Colours (h, w, 3) of a view with metal in green."""
+    alpha = _OPACITY * np.sqrt(thickness)[..., None]
+    return grey * (1 - alpha) + GREEN * (0.25 + 0.75 * grey) * alpha
 
 
 def _write(axes: Axes, text: str) -> None:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from typing import Any
+
+from numpy.typing import NDArray
+from PIL import Image
 
 VERDICTS = ("ok", "doubtful", "failed")
 
@@ -41,6 +45,7 @@ class Page:
         warnings: what a user should know before trusting the numbers.
         rows: the table.
         scene: of the 3D view, see `implant_scene`; None for none.
+        layers: label, PNG of a measured view, and PNG of it with the implant: blinked, as a checkerboard, wiped.
         pictures: title and PNG of each.
         details: title and text of each, folded away.
         made_with: a line about versions.
@@ -52,6 +57,7 @@ class Page:
     warnings: Sequence[str] = ()
     rows: Sequence[Row] = ()
     scene: dict[str, Any] | None = None
+    layers: Sequence[tuple[str, bytes, bytes]] = ()
     pictures: Sequence[tuple[str, bytes]] = ()
     details: Sequence[tuple[str, str]] = ()
     made_with: str = ""
@@ -68,10 +74,17 @@ def page_html(page: Page) -> str:
     """
     if page.verdict is not None and page.verdict not in VERDICTS:
         raise ValueError(f"verdict must be one of {', '.join(VERDICTS)}, got {page.verdict!r}")
-    parts = [f"<h1>{escape(page.title)}</h1>", _verdict(page), _table(page.rows), _viewer(page.scene)]
+    parts = [
+        f"<h1>{escape(page.title)}</h1>",
+        _verdict(page),
+        _table(page.rows),
+        _layers(page.layers),
+        _viewer(page.scene),
+    ]
     parts += [_pictures(page.pictures), *(_folded(title, text) for title, text in page.details)]
     web = files("torchkcreg.visualization") / "web"
-    style, script = (web.joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "viewer.js"))
+    files_of_page = ("page.css", "viewer.js", "layers.js")
+    style, *scripts = (web.joinpath(name).read_text(encoding="utf-8") for name in files_of_page)
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
     return "\n".join(
         [
@@ -81,7 +94,7 @@ def page_html(page: Page) -> str:
             f"<title>{escape(page.title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>",
             *(part for part in parts if part),
             f"<footer>{escape(page.made_with)}</footer>\n</main>",
-            f"<script>\n{script}</script>\n</body>\n</html>\n",
+            f"<script>\n{''.join(scripts)}</script>\n</body>\n</html>\n",
         ]
     )
 
@@ -107,6 +120,38 @@ def _table(rows: Sequence[Row]) -> str:
     return f'<section><h2>Numbers</h2><div class="wide"><table>{head}{"".join(lines)}</table></div></section>'
 
 
+def _layers(layers: Sequence[tuple[str, bytes, bytes]]) -> str:
+    if not layers:
+        return ""
+    options = "".join(f"<option>{escape(label)}</option>" for label, _, _ in layers)
+    kinds = ("overlay", "measured", "blink", "checkerboard", "wipe")
+    modes = "".join(f"<option>{kind}</option>" for kind in kinds)
+    images = "".join(
+        f'<img hidden alt="" src="{_data(measured)}"><img hidden alt="" src="{_data(overlay)}">'
+        for _, measured, overlay in layers
+    )
+    return (
+        f'<section class="layers"><h2>The implant over the measured views</h2>{images}'
+        '<canvas role="img" aria-label="A measured view with the registered implant in green"></canvas>'
+        f'<div class="controls"><label>view <select name="view">{options}</select></label>'
+        f'<label>show <select name="mode">{modes}</select></label>'
+        '<label>place, size <input type="range" name="place" min="0" max="100" value="50"></label></div>'
+        "<p>Green where the implant is in the model. Where its shadow stays white, or green lies beside it, the two "
+        "do not agree.</p></section>"
+    )
+
+
+def _data(png: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+
+
+def png_of(image: NDArray) -> bytes:
+    """A PNG of an image, uint8 (rows, cols) or (rows, cols, 3)."""
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
 def _viewer(scene: dict[str, Any] | None) -> str:
     if scene is None:
         return ""
@@ -129,8 +174,7 @@ def _pictures(pictures: Sequence[tuple[str, bytes]]) -> str:
     if not pictures:
         return ""
     shown = "".join(
-        f'<figure><img alt="{escape(title)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-        f"<figcaption>{escape(title)}</figcaption></figure>"
+        f'<figure><img alt="{escape(title)}" src="{_data(png)}"><figcaption>{escape(title)}</figcaption></figure>'
         for title, png in pictures
     )
     return f"<section><h2>Pictures</h2>{shown}</section>"

@@ -1,0 +1,32 @@
+// A measured view and the same with the implant: one over the other, blinked, as a checkerboard, or wiped.
+for (const box of document.querySelectorAll(".layers")) {
+  const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), images = [...box.querySelectorAll("img")];
+  const field = name => box.querySelector(`[name=${name}]`);
+  let shown = true;
+
+  function draw() {
+    const view = field("view").selectedIndex, mode = field("mode").value, place = Number(field("place").value) / 100;
+    const [under, over] = [images[2 * view], images[2 * view + 1]];
+    if (!under.naturalWidth || !over.naturalWidth) return;
+    const ratio = window.devicePixelRatio || 1, most = Math.min(canvas.parentElement.clientWidth - 32, 900);
+    const scale = Math.min(most / under.naturalWidth, Math.max(320, 0.7 * window.innerHeight) / under.naturalHeight);
+    const width = Math.round(under.naturalWidth * scale), height = Math.round(under.naturalHeight * scale);
+    canvas.style.width = width + "px"; canvas.style.height = height + "px";
+    canvas.width = width * ratio; canvas.height = height * ratio;
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.drawImage(mode === "overlay" || (mode === "blink" && shown) ? over : under, 0, 0, width, height);
+    if (mode !== "checkerboard" && mode !== "wipe") return;
+    pen.save(); pen.beginPath();
+    if (mode === "wipe") pen.rect(0, 0, place * width, height);
+    else {
+      const side = 8 + place * Math.max(width, height) / 4;
+      for (let j = 0; j * side < height; j++) for (let i = j % 2; i * side < width; i += 2) pen.rect(i * side, j * side, side, side);
+    }
+    pen.clip(); pen.drawImage(over, 0, 0, width, height); pen.restore();
+  }
+  setInterval(() => { if (field("mode").value === "blink") { shown = !shown; draw(); } }, 500);
+  for (const control of box.querySelectorAll("input, select")) control.addEventListener("input", draw);
+  for (const image of images) image.addEventListener("load", draw);
+  window.addEventListener("resize", draw);
+  draw();
+}
