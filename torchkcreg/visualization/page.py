@@ -132,10 +132,10 @@ def _layers(layers: Sequence[tuple[str, bytes, bytes]]) -> str:
     )
     return (
         f'<section class="layers"><h2>The implant over the measured views</h2>{images}'
-        '<canvas role="img" aria-label="A measured view with the registered implant in green"></canvas>'
         f'<div class="controls"><label>view <select name="view">{options}</select></label>'
         f'<label>show <select name="mode">{modes}</select></label>'
         '<label>place, size <input type="range" name="place" min="0" max="100" value="50"></label></div>'
+        '<canvas role="img" aria-label="A measured view with the registered implant in green"></canvas>'
         "<p>Green where the implant is in the model. Where its shadow stays white, or green lies beside it, the two "
         "do not agree.</p></section>"
     )

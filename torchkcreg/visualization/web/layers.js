@@ -9,7 +9,7 @@ for (const box of document.querySelectorAll(".layers")) {
     const [under, over] = [images[2 * view], images[2 * view + 1]];
     if (!under.naturalWidth || !over.naturalWidth) return;
     const ratio = window.devicePixelRatio || 1, most = Math.min(canvas.parentElement.clientWidth - 32, 900);
-    const scale = Math.min(most / under.naturalWidth, Math.max(320, 0.7 * window.innerHeight) / under.naturalHeight);
+    const scale = Math.min(most / under.naturalWidth, Math.min(720, Math.max(320, 0.7 * window.innerHeight)) / under.naturalHeight);
     const width = Math.round(under.naturalWidth * scale), height = Math.round(under.naturalHeight * scale);
     canvas.style.width = width + "px"; canvas.style.height = height + "px";
     canvas.width = width * ratio; canvas.height = height * ratio;
