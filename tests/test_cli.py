@@ -12,7 +12,7 @@ from torchkcreg.cli import main
 from torchkcreg.geometry import transform_points
 from torchkcreg.io import read_components, read_geometry, read_points, read_projections, read_run, write_json
 
-FIGURES = {"overlay.png", "displacement.png", "history.png"}
+FIGURES = {"overlay.png", "displacement.png", "history.png", "overlay.npz", "report.html"}
 RUN_FILES = {"config.yaml", "versions.json", "checkpoint.pt", "history.json", "metrics.json", "deformation.json"}
 EXPORTS = {"dvf.mha", "bspline.tfm", "implant_deformed.ply", "arrays.npz", "uncertainty.json"}
 

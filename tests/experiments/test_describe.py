@@ -3,6 +3,7 @@ import pytest
 import SimpleITK as sitk
 import torch
 
+from torchkcreg.cli import main
 from torchkcreg.experiments import describe, describe_installation
 from torchkcreg.geometry import VolumeGrid
 from torchkcreg.io import read_geometry, write_geometry, write_init, write_mesh, write_spectrum, write_volume
@@ -23,6 +24,14 @@ def test_a_geometry_is_described_view_by_view(small_case):
     assert "3 views of 192 x 80 pixels" in lines[0]
     assert "source to detector 538 mm" in lines[0]
     assert lines[2].strip() == "view 1: 48 degrees, source T2 at (270.3, 300.2, 0.0) mm"
+
+
+def test_a_geometry_is_drawn(small_case, tmp_path, capsys):
+    assert main(["info", str(small_case / "geometry.json"), "--picture", str(tmp_path / "g.png")]) == 0
+    assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")
+    assert "3 views" in capsys.readouterr().out
+    assert main(["info", "--picture", str(tmp_path / "g.png")]) == 2
+    assert "of one geometry, got 0 files" in capsys.readouterr().err
 
 
 def test_projections_are_described_with_what_is_masked(tmp_path):

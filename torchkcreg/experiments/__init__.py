@@ -5,7 +5,7 @@ from torchkcreg.experiments.compare_files import Comparison, compare_files
 from torchkcreg.experiments.convert_files import convert_geometry
 from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.densitometry_files import densitometry_files
-from torchkcreg.experiments.describe import describe, describe_installation
+from torchkcreg.experiments.describe import describe, describe_installation, picture_geometry
 from torchkcreg.experiments.dry_run import dry_run
 from torchkcreg.experiments.evaluate_files import FileEvaluation, evaluate_files
 from torchkcreg.experiments.figures import draw_registration
@@ -47,6 +47,7 @@ __all__ = [
     "evaluate_files",
     "implant_of_run",
     "load_files",
+    "picture_geometry",
     "plan_files",
     "reconstruct_files",
     "register_files",

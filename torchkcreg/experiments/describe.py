@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -25,8 +25,10 @@ from torchkcreg.io import (
     read_spectrum,
     read_volume,
     versions,
+    write_figure,
 )
 from torchkcreg.kernels import PACKAGE, choose_backend, unavailable_reason
+from torchkcreg.visualization import geometry_figure
 
 from .describe_run import describe_run
 
@@ -83,6 +85,17 @@ def describe(path: Path, *, open_beam: float | None = None) -> str:
             return f"{path}: {_first(path, candidates)}"
     known = ", ".join(suffix for suffixes in readers for suffix in suffixes)
     raise ValueError(f"{path} is none of what can be described: a folder of results, or a file ending in {known}")
+
+
+def picture_geometry(paths: Sequence[Path], out: Path) -> None:
+    """Writes a figure of a geometry's focal spots and detectors.
+
+    Raises:
+        ValueError: Not one file, or one that says too little.
+    """
+    if len(paths) != 1:
+        raise ValueError(f"a picture is of one geometry, got {len(paths)} files")
+    write_figure(out, geometry_figure(read_geometry(paths[0]), title=paths[0].name))
 
 
 def _first(path: Path, candidates: list[Callable[[Path], str]]) -> str:

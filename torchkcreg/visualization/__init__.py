@@ -9,6 +9,7 @@ from .case import case_figure
 from .comparison import comparison_figure
 from .displacement import displacement_figure
 from .errors import error_map_figure, histogram_figure
+from .geometry import geometry_figure
 from .history import history_figure
 from .load import load_figure
 from .overlay import overlay_figure, overlay_layers
@@ -26,6 +27,7 @@ __all__ = [
     "comparison_figure",
     "displacement_figure",
     "error_map_figure",
+    "geometry_figure",
     "histogram_figure",
     "history_figure",
     "load_figure",

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchkcreg.physics import Beam
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+from .style import COLOURS, new_figure, open_frame
+
 _LEAST_SHARE = 0.98  # of a pixel's metal: what is drawn for one metal has next to nothing of the others
 
 
@@ -24,11 +25,11 @@ def beam_figure(beam: Beam, names: Sequence[str], lengths_mm: Tensor, measured: 
         lengths_mm: Path lengths (M, N) of the pixels.
         measured: Their transmissions (N,) without the background's.
     """
-    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    figure = new_figure(5.2, 3.6)
     axes = figure.subplots()
     total = lengths_mm.sum(0)
     longest = float(total.max())
-    for row, (name, colour) in enumerate(zip(names, _COLOURS * len(names))):
+    for row, (name, colour) in enumerate(zip(names, COLOURS * len(names))):
         own = lengths_mm[row] > _LEAST_SHARE * total
         line = torch.linspace(0, longest, 100, dtype=torch.float64, device="cpu")
         paths = torch.zeros(1, len(names), 1, 1, len(line), dtype=torch.float64, device="cpu")
@@ -44,6 +45,6 @@ def beam_figure(beam: Beam, names: Sequence[str], lengths_mm: Tensor, measured: 
         at = [float(np.median(lengths[g])) for g in groups]
         axes.errorbar(at, middle, yerr=error, fmt="o", markersize=3, color=colour, linewidth=1)
     axes.set(yscale="log", xlabel="thickness, mm", ylabel="transmission", ylim=(1e-3, 1.3))
-    axes.spines[["top", "right"]].set_visible(False)
+    open_frame(axes)
     axes.legend(frameon=False)
     return figure

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-_COLOURS = ("#2a6fbb", "#c8702a", "#4b9b53", "#8d5aa8")
+from .style import COLOURS, new_figure, open_frame
+
 _SIZES = (10, 7, 5, 3)  # equal shares stay visible behind each other
 
 
@@ -27,11 +28,11 @@ def capture_figure(
     Raises:
         ValueError: there is no curve, more than four, or one whose offsets and shares differ in number.
     """
-    if not 0 < len(curves) <= len(_COLOURS):
-        raise ValueError(f"there must be one to {len(_COLOURS)} curves, got {len(curves)}")
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained", facecolor="white")
+    if not 0 < len(curves) <= len(_SIZES):
+        raise ValueError(f"there must be one to {len(_SIZES)} curves, got {len(curves)}")
+    figure = new_figure(6.4, 4.0)
     axes = figure.subplots()
-    for (name, (offsets, shares)), colour, size in zip(curves.items(), _COLOURS, _SIZES):
+    for (name, (offsets, shares)), colour, size in zip(curves.items(), COLOURS, _SIZES):
         if len(offsets) != len(shares) or not offsets:
             raise ValueError(f"curve {name!r} has {len(offsets)} offsets and {len(shares)} shares")
         axes.plot(offsets, shares, "o-", color=colour, markersize=size, label=name, clip_on=False, zorder=3)
@@ -44,6 +45,5 @@ def capture_figure(
     axes.set_ylabel(f"end below {captured_mm:g} mm rigid error")
     axes.grid(True, color="0.92", linewidth=0.6)
     axes.legend(frameon=False, fontsize=9, loc="lower left")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    open_frame(axes)
     return figure

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
 
+from .style import new_figure
+
 _MOST = 6
 _BRIGHTEST = 0.998  # dead pixels are brighter
 
@@ -24,7 +26,7 @@ def case_figure(line_integrals: Tensor, geometry: ConeBeamGeometry, *, title: st
     shown = sorted({round(i * (number - 1) / max(min(number, _MOST) - 1, 1)) for i in range(min(number, _MOST))})
     rows, cols = line_integrals.shape[1:]
     width = 1.9
-    figure = Figure(figsize=(width * len(shown), min(width * rows / cols, 8.0) + 0.6), layout="constrained")
+    figure = new_figure(width * len(shown), min(width * rows / cols, 8.0) + 0.6)
     figure.suptitle(title)
     for axes, view in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         image = line_integrals[view].numpy()

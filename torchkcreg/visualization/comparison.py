@@ -11,7 +11,9 @@ from matplotlib.figure import Figure
 
 from torchkcreg.evaluation import AXES, RelativeMotion
 
-_COLOURS = dict(zip(AXES, ("#0072B2", "#E69F00", "#009E73"), strict=True))
+from .style import COLOURS, new_figure, open_frame
+
+_COLOURS = dict(zip(AXES, COLOURS[:3], strict=True))
 
 
 def comparison_figure(motions: Sequence[RelativeMotion], names: Sequence[str], loads: Sequence[float] = ()) -> Figure:
@@ -22,7 +24,7 @@ def comparison_figure(motions: Sequence[RelativeMotion], names: Sequence[str], l
         names: Of the runs.
         loads: N, one a run; a figure without curves if empty.
     """
-    figure = Figure(figsize=(9.5, 6.4 if loads else 4.6), layout="constrained", facecolor="white")
+    figure = new_figure(9.5, 6.4 if loads else 4.6)
     parts: Any = figure.subfigures(2, 1, height_ratios=[3, 2]) if loads else [figure]
     panels = parts[0].subplots(3, 1, sharex=True)
     shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(motions)))
@@ -42,8 +44,7 @@ def comparison_figure(motions: Sequence[RelativeMotion], names: Sequence[str], l
     if loads:
         _curves(parts[1], motions, loads)
     for axes in figure.axes:
-        for edge in ("top", "right"):
-            axes.spines[edge].set_visible(False)
+        open_frame(axes)
     return figure
 
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from .style import new_figure, open_frame
+
 COLOUR_MAP = "viridis"
 _MOST_NODES = 40000
 _HEIGHT_IN = 6.5
@@ -70,7 +72,7 @@ def displacement_figure(
     ]
     limits = [_limits(nodes, frame) for _, frame in views]
     widths = [(right - left) * nodes.inch_per_mm for left, right in limits]
-    figure = Figure(figsize=(sum(widths) + 2.6, _HEIGHT_IN + 1.0), layout="constrained", facecolor="white")
+    figure = new_figure(sum(widths) + 2.6, _HEIGHT_IN + 1.0)
     axes = figure.subplots(1, len(views), gridspec_kw={"width_ratios": widths}, sharey=True)
     for axis, (name, frame), limit in zip(axes, views, limits):
         dots = _draw(axis, nodes, frame, norm)
@@ -131,6 +133,5 @@ def _draw(axes: Axes, nodes: _Upright, frame: NDArray, norm: Normalize) -> PathC
     axes.xaxis.set_major_locator(MaxNLocator(2, integer=True))
     axes.grid(True, color="0.92", linewidth=0.6)
     axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    open_frame(axes)
     return dots

@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from .displacement import _HEIGHT_IN, _draw, _limits, _projection, _upright
+from .style import AMBER, BLUE, GREEN, new_figure, open_frame
 
 _VIEWS = (("front", 0.0, 0.0), ("back", 180.0, 0.0), ("edge", 90.0, 0.0), ("oblique", 40.0, 25.0))
 _DOT = 2.0  # random samples leave gaps that a lattice does not
-_COLOURS = ("0.55", "#2a6fbb", "#c8702a", "#4b9b53")
+_COLOURS = ("0.55", BLUE, AMBER, GREEN)
 
 
 def error_map_figure(
@@ -51,7 +52,7 @@ def error_map_figure(
     frames = [_projection(turn, tilt) for _, turn, tilt in _VIEWS]
     limits = [_limits(nodes, frame) for frame in frames]
     widths = [(right - left) * nodes.inch_per_mm for left, right in limits]
-    figure = Figure(figsize=(sum(widths) + 3.0, _HEIGHT_IN + 1.0), layout="constrained", facecolor="white")
+    figure = new_figure(sum(widths) + 3.0, _HEIGHT_IN + 1.0)
     axes = figure.subplots(1, len(_VIEWS), gridspec_kw={"width_ratios": widths}, sharey=True)
     for axis, (name, *_), frame, view in zip(axes, _VIEWS, frames, limits):
         dots = _draw(axis, nodes, frame, Normalize(0, limit))
@@ -94,7 +95,7 @@ def histogram_figure(
     arrays = {name: values.detach().cpu().double().numpy() for name, values in distances.items()}
     end = max(max(float(np.quantile(values, 0.995)) for values in arrays.values()), 1e-6)
     edges = np.linspace(0, end, num_bins + 1)
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained", facecolor="white")
+    figure = new_figure(6.4, 4.0)
     axes = figure.subplots()
     for (name, values), colour in zip(arrays.items(), _COLOURS):
         width = "" if fwhm_mm is None or name not in fwhm_mm else f", FWHM {fwhm_mm[name]:.3f}"
@@ -108,8 +109,7 @@ def histogram_figure(
     axes.set_xlabel(xlabel)
     axes.set_ylabel("share of points (%)")
     axes.legend(frameon=False, fontsize=9)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    open_frame(axes)
     if title:
         axes.set_title(title, fontsize=11)
     return figure

@@ -11,8 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from .style import BLUE, GREEN, RED, new_figure, open_frame
+
 _PANELS = (("loss", "loss", False), ("gc", "gradient correlation", False), ("step_mm", "step (mm)", True))
-_COLOURS = ("#1f5fa8", "#2a8f4f", "#b0522d")
+_COLOURS = (BLUE, GREEN, RED)
 
 
 def history_figure(history: Sequence[dict[str, Any]], *, stage_labels: Sequence[str] | None = None) -> Figure:
@@ -35,7 +37,7 @@ def history_figure(history: Sequence[dict[str, Any]], *, stage_labels: Sequence[
     spans = _spans(x, stages)
     panels = [panel for panel in _PANELS if any(record.get(panel[0]) is not None for record in history)]
 
-    figure = Figure(figsize=(8.5, 0.6 + 2.3 * len(panels)), layout="constrained", facecolor="white")
+    figure = new_figure(8.5, 0.6 + 2.3 * len(panels))
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (key, label, logarithmic), colour in zip(axes, panels, _COLOURS):
         y = np.array([np.nan if r.get(key) is None else float(r[key]) for r in history])
@@ -56,8 +58,7 @@ def _curve(axis: Axes, x: NDArray, y: NDArray, stages: list[Any], colour: str, l
     if logarithmic:
         axis.set_yscale("log", nonpositive="mask")
     axis.grid(True, color="0.92", linewidth=0.6)
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
+    open_frame(axis)
 
 
 def _spans(x: NDArray, stages: list[Any]) -> list[tuple[Any, float, float]]:

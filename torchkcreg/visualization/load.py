@@ -8,10 +8,12 @@ from torch import Tensor
 
 from torchkcreg.mechanics import CarriedLoad
 
+from .style import AMBER, BLUE, GREEN, new_figure, open_frame
+
 _MOMENTS = {
-    3: ("bending out of its plane", "#0072B2"),
-    4: ("bending in its plane", "#E69F00"),
-    5: ("torsion", "#009E73"),
+    3: ("bending out of its plane", BLUE),
+    4: ("bending in its plane", AMBER),
+    5: ("torsion", GREEN),
 }
 
 
@@ -27,7 +29,7 @@ def load_figure(
         yield_stress: Where the alloy begins to stay bent, N/mm^2.
         title: Above the figure.
     """
-    figure = Figure(figsize=(9.5, 5.6), layout="constrained", facecolor="white")
+    figure = new_figure(9.5, 5.6)
     top, *rows = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": [3, 1, 1]})
     height = carried.heights.cpu().numpy()
     for component, (name, colour) in _MOMENTS.items():
@@ -52,8 +54,7 @@ def load_figure(
         )
         axes.set_aspect("equal")
         axes.set_ylabel(f"{name}\n(mm)")
-        for edge in ("top", "right"):
-            axes.spines[edge].set_visible(False)
+        open_frame(axes)
     rows[-1].set_xlabel("along the implant (mm); grey lines: where it may be held")
     told = "" if yield_stress is None else f"; yield {yield_stress:.0f}"
     figure.colorbar(dots, ax=rows, label=f"von Mises\n(MPa{told})", shrink=0.9, pad=0.01, aspect=10, extend="max")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchkcreg.registration import PlannedSet
 
-_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
+from .style import COLOURS, new_figure, open_frame
 
 
 def plan_figure(
@@ -30,7 +30,7 @@ def plan_figure(
         labels: Their views in words.
         angles_deg: Of all views.
     """
-    figure = Figure(figsize=(9.5, 4.2), layout="constrained", facecolor="white")
+    figure = new_figure(9.5, 4.2)
     left = figure.add_subplot(1, 2, 1)
     numbers = list(best)
     for low, high, shade in ((0.05, 0.95, 0.25), (0.25, 0.75, 0.4)):
@@ -39,17 +39,16 @@ def plan_figure(
     left.plot(
         numbers, [float(random[n].median()) for n in numbers], color="0.4", label="random views: median, 50, 90 %"
     )
-    left.plot(numbers, [best[n][0].node_std_mm for n in numbers], "o-", color=_COLOURS[0], label="best views")
+    left.plot(numbers, [best[n][0].node_std_mm for n in numbers], "o-", color=COLOURS[0], label="best views")
     left.set(xlabel="number of views", ylabel="expected error of the nodes (mm)", xticks=numbers, yscale="log")
     left.set_yticks([t for t in (0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0) if _inside(t, left.get_ylim())])
     left.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     left.yaxis.set_minor_formatter("")
     left.legend(frameon=False, fontsize=9)
-    for edge in ("top", "right"):
-        left.spines[edge].set_visible(False)
+    open_frame(left)
     if angles_deg is not None:
         right = figure.add_subplot(1, 2, 2, projection="polar")
-        for rank, (one, words, colour) in enumerate(zip(shown, labels, _COLOURS, strict=False)):
+        for rank, (one, words, colour) in enumerate(zip(shown, labels, COLOURS, strict=False)):
             angles = np.radians([angles_deg[view] for view in one.views])
             radius = 1 - 0.12 * rank
             right.scatter(angles, np.full(len(angles), radius), color=colour, label=f"{one.node_std_mm:.3f} mm")

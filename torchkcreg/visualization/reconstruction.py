@@ -11,7 +11,9 @@ from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid
 
-_COLOURS = ("#444444", "#d95f02", "#1b9e77", "#7570b3", "#e7298a")
+from .style import COLOURS
+
+_COLOURS = ("0.25", *COLOURS[:4])
 
 
 def reconstruction_figure(

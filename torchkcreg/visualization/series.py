@@ -13,6 +13,7 @@ from torch import Tensor
 from torchkcreg.geometry import principal_axes
 
 from .displacement import COLOUR_MAP
+from .style import new_figure
 
 _EXAGGERATIONS = (20.0, 10.0, 5.0, 2.0, 1.0)
 _DRAWN_SHARE = 0.1  # of the implant's length: as far as the largest displacement is drawn
@@ -34,7 +35,7 @@ def series_figure(panels: Mapping[str, tuple[Tensor, Tensor]], *, label: str) ->
     lengths = {name: vectors.norm(dim=1).numpy() for name, (_, vectors) in panels.items()}
     largest = max(float(length.max()) for length in lengths.values())
     norm = Normalize(0.0, max(largest, 1e-9))
-    figure = Figure(figsize=(_WIDTH_IN * len(panels) + 1.4, _HEIGHT_IN), layout="constrained")
+    figure = new_figure(_WIDTH_IN * len(panels) + 1.4, _HEIGHT_IN)
     columns = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (name, (nodes, vectors)) in zip(columns, panels.items(), strict=True):
         _, directions = principal_axes(nodes)

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-_BLUE, _SKY, _RED, _AMBER, _GREEN = "#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#009E73"
-_STATUS = {"ok": (_BLUE, _BLUE), "doubtful": (_AMBER, "none"), "failed": (_RED, "none")}
+from .style import AMBER, BLUE, GREEN, RED, SKY, new_figure
+
+_STATUS = {"ok": (BLUE, BLUE), "doubtful": (AMBER, "none"), "failed": (RED, "none")}
 _AGAINST = {"azimuth": "gantry angle (degrees; 90: face on)", "scatter": "scatter", "gc": "gradient correlation"}
 _MM_TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 
 def errors_figure(rows: Sequence[Mapping[str, Any]], *, right_mm: float) -> Figure:
     """Errors against azimuth, scatter and gradient correlation; what the verdict doubts is hollow."""
-    figure = Figure(figsize=(12, 3.6), layout="constrained", facecolor="white")
+    figure = new_figure(12, 3.6)
     axes = figure.subplots(1, 3, sharey=True)
     for axis, (name, label) in zip(axes, _AGAINST.items(), strict=True):
         for status, (edge, face) in _STATUS.items():
@@ -37,16 +38,16 @@ def verdict_figure(rows: Sequence[Mapping[str, Any]], *, wrong_mm: float, right_
     worst = np.array([row["worst"] for row in rows])
     wrong, right = worst > wrong_mm, worst < right_mm
     thresholds = np.linspace(0.01, 0.2, 191)
-    figure = Figure(figsize=(9, 3.6), layout="constrained", facecolor="white")
+    figure = new_figure(9, 3.6)
     left, curve = figure.subplots(1, 2)
-    left.scatter(expected, worst, s=24, color=_BLUE)
+    left.scatter(expected, worst, s=24, color=BLUE)
     left.axhline(wrong_mm, color="0.8", zorder=0)
     left.set(xlabel="node_std_mm", ylabel="largest error figure (mm)", xscale="log", yscale="log")
     _ticks(left.xaxis, expected)
     missed = [float((wrong & (expected <= t)).sum()) for t in thresholds]
     idle = [float((right & (expected > t)).sum()) for t in thresholds]
-    curve.step(thresholds, missed, where="post", color=_RED, label=f"missed, of {wrong.sum()} above {wrong_mm} mm")
-    curve.step(thresholds, idle, where="post", color=_BLUE, label=f"idle, of {right.sum()} below {right_mm} mm")
+    curve.step(thresholds, missed, where="post", color=RED, label=f"missed, of {wrong.sum()} above {wrong_mm} mm")
+    curve.step(thresholds, idle, where="post", color=BLUE, label=f"idle, of {right.sum()} below {right_mm} mm")
     curve.set(xlabel="threshold of node_std_mm (mm)", ylabel="registrations")
     curve.legend(frameon=False)
     return figure
@@ -54,12 +55,12 @@ def verdict_figure(rows: Sequence[Mapping[str, Any]], *, wrong_mm: float, right_
 
 def coverage_figure(widths: Sequence[float], curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     """Share of true positions within intervals over their half width in stated deviations, a panel a set of cases."""
-    figure = Figure(figsize=(4.4 * len(curves), 3.8), layout="constrained", facecolor="white")
+    figure = new_figure(4.4 * len(curves), 3.8)
     axes = np.atleast_1d(figure.subplots(1, len(curves), sharey=True))
     normal = [math.erf(width / math.sqrt(2)) for width in widths]
     for axis, (title, parts) in zip(axes, curves.items(), strict=True):
         axis.plot(widths, normal, color="0.6", linestyle="--", label="normal distribution")
-        for (name, curve), colour in zip(parts.items(), (_BLUE, _SKY, _RED, _AMBER), strict=True):
+        for (name, curve), colour in zip(parts.items(), (BLUE, SKY, RED, AMBER), strict=True):
             axis.plot(widths, curve, color=colour, label=name)
         axis.set(xlabel="half width (stated standard deviations)", title=title)
     axes[0].set_ylabel("share of true positions in it")
@@ -76,11 +77,11 @@ def geometry_figure(
         errors: A panel each, by its title: of each error of the geometry by its name, for each way to register, mm.
         labels: Of the ways, in words.
     """
-    figure = Figure(figsize=(11.0, 3.8), layout="constrained", facecolor="white")
+    figure = new_figure(11.0, 3.8)
     axes = figure.subplots(1, len(errors), sharey=True)
     for axis, (title, names) in zip(axes, errors.items(), strict=True):
         for place, ways in enumerate(names.values()):
-            for number, (way, colour) in enumerate(zip(labels, (_RED, _BLUE), strict=False)):
+            for number, (way, colour) in enumerate(zip(labels, (RED, BLUE), strict=False)):
                 x, values = place + 0.3 * (number - 0.5), np.array(ways[way])
                 spread = np.linspace(-0.09, 0.09, len(values)) if len(values) > 1 else np.zeros(1)
                 words = labels[way] if not place else None
@@ -102,9 +103,9 @@ def loads_figure(loads: Sequence[float], curves: Mapping[str, Sequence[Sequence[
         loads: N.
         curves: Errors in mm for each load, by what they were registered with.
     """
-    figure = Figure(figsize=(6.0, 3.8), layout="constrained", facecolor="white")
+    figure = new_figure(6.0, 3.8)
     axis = figure.subplots()
-    for (name, errors), colour in zip(curves.items(), (_RED, _AMBER, _BLUE, _SKY), strict=False):
+    for (name, errors), colour in zip(curves.items(), (RED, AMBER, BLUE, SKY), strict=False):
         there = [(load, some) for load, some in zip(loads, errors, strict=True) if some]
         axis.scatter(
             [x for x, some in there for _ in some], [y for _, some in there for y in some], 12, colour, alpha=0.5
@@ -118,11 +119,11 @@ def loads_figure(loads: Sequence[float], curves: Mapping[str, Sequence[Sequence[
 
 def planned_figure(expected: Sequence[float], found: Sequence[float], planned: Sequence[bool]) -> Figure:
     """Errors of sets of views against what was expected of them before any image; planned sets are filled."""
-    figure = Figure(figsize=(5.0, 4.2), layout="constrained", facecolor="white")
+    figure = new_figure(5.0, 4.2)
     axis, chosen = figure.subplots(), np.array(planned, dtype=bool)
     x, y = np.array(expected), np.array(found)
     axis.scatter(x[~chosen], y[~chosen], s=24, facecolors="none", edgecolors="0.5", label="random views")
-    axis.scatter(x[chosen], y[chosen], s=36, color=_GREEN, label="planned views")
+    axis.scatter(x[chosen], y[chosen], s=36, color=GREEN, label="planned views")
     axis.set(xlabel="expected error (mm)", ylabel="error of the nodes (mm, RMS)", xscale="log", yscale="log")
     _ticks(axis.xaxis, x)
     _ticks(axis.yaxis, y)
