@@ -117,6 +117,30 @@ def test_installing_without_a_compiler_succeeds(package: Path):
 
 
 @pytest.mark.slow
+def test_a_source_distribution_holds_what_a_wheel_is_built_from(package: Path, tmp_path: Path):
+    root = SOURCE.parent
+    if not (root / "setup.py").is_file():
+        pytest.skip("the package is installed without its sources")
+    for name in ("setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
+        shutil.copy(root / name, package.parent / name)
+    made = run_python(package, "setup.py", "--quiet", "sdist", "--dist-dir", str(tmp_path), compiler=None)
+    assert made.returncode == 0, made.stderr
+    (archive,) = tmp_path.glob("torchkcreg-*.tar.gz")
+    shutil.unpack_archive(archive, tmp_path / "unpacked")
+    (unpacked,) = (tmp_path / "unpacked").iterdir()
+    shutil.rmtree(package)
+    built = subprocess.run(
+        [sys.executable, "setup.py", "--quiet", "build", "--build-lib", "built"],
+        cwd=unpacked, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    files = {str(path.relative_to(unpacked / "built")) for path in (unpacked / "built").rglob("*") if path.is_file()}
+    there = {str(Path("torchkcreg") / path.relative_to(SOURCE)) for path in SOURCE.rglob("*") if path.is_file()}
+    missing = {name for name in there - files if "__pycache__" not in name and "_C" not in name}
+    assert missing == set()
+
+
+@pytest.mark.slow
 def test_kernels_are_compiled_at_first_use_where_there_is_a_compiler(package: Path):
     if shutil.which("c++") is None:
         pytest.skip("no compiler")

@@ -207,7 +207,7 @@ def test_dicom_that_does_not_say_enough_is_refused(tmp_path):
         with pytest.raises(ValueError, match=reason):
             read_geometry(tmp_path / "x.dcm")
 
-    refused("do not say DistanceSourceToDetector", DistanceSourceToDetector=None)
+    refused("DistanceSourceToDetector must hold numbers", DistanceSourceToDetector=None)
     refused("must lie between 0 and", DistanceSourceToPatient=1300)
     refused("Increment has 2 values for 3 frames", PositionerPrimaryAngleIncrement=[0, 1])
     refused("flipped or turned", FieldOfViewHorizontalFlip="YES")

@@ -30,7 +30,7 @@ def dicom_images(path: Path) -> NDArray:
         ImportError: pydicom is not installed.
     """
     data = _tags(path, pixels=True)
-    relation = data.get("PixelIntensityRelationship", "") or ""
+    relation = _text(data, "PixelIntensityRelationship")
     if relation not in ("", "LIN"):
         raise ValueError(
             f"its pixels are {relation} of the X-ray intensity (PixelIntensityRelationship), not in proportion to it: "
@@ -40,8 +40,8 @@ def dicom_images(path: Path) -> NDArray:
         images = np.asarray(data.pixel_array)
     except Exception as error:  # pydicom's and its decoders' own
         raise ValueError(f"{path.name} has no pixels that can be read: {str(error).splitlines()[0]}") from error
-    if int(data.get("SamplesPerPixel", 1) or 1) != 1:
-        raise ValueError(f"{path.name} has {data.SamplesPerPixel} numbers a pixel: grey images have one")
+    if (samples := _number(data, "SamplesPerPixel", 1)) != 1:
+        raise ValueError(f"{path.name} has {samples:g} numbers a pixel: grey images have one")
     slope, intercept = _number(data, "RescaleSlope", 1.0), _number(data, "RescaleIntercept", 0.0)
     images = images if (slope, intercept) == (1.0, 0.0) else (images * slope + intercept).astype(np.float32)
     return images.reshape(-1, *images.shape[-2:])
@@ -65,7 +65,7 @@ def read_dicom_geometry(path: Path) -> ConeBeamGeometry:
         raise ValueError("holds no DICOM files (.dcm)")
     tags = sorted((_tags(file) for file in files), key=lambda one: int(_number(one, "InstanceNumber", 0)))
     first = tags[0]
-    if first.get("FieldOfViewHorizontalFlip", "") == "YES" or _number(first, "FieldOfViewRotation", 0) != 0:
+    if _text(first, "FieldOfViewHorizontalFlip") == "YES" or _number(first, "FieldOfViewRotation", 0) != 0:
         raise ValueError("images are flipped or turned against the detector (FieldOfView tags): undo that first")
     primary, secondary = (
         torch.cat([_angles(one, name) for one in tags]).deg2rad()
@@ -90,7 +90,7 @@ def _angles(tags: Any, name: str) -> Tensor:
     """Degrees of each frame: the initial angle, and an average step or each frame's offset (PS3.3 C.8.7.5.1.3)."""
     frames = int(_number(tags, "NumberOfFrames", 1))
     start = _number(tags, name, 0.0 if name == "PositionerSecondaryAngle" else None)
-    steps = _numbers(tags, f"{name}Increment") if tags.get(f"{name}Increment") is not None else [0.0]
+    steps = _numbers(tags, f"{name}Increment") if f"{name}Increment" in tags else [0.0]
     if len(steps) == 1:
         return start + steps[0] * torch.arange(frames, dtype=torch.float64)
     if len(steps) != frames:
@@ -110,8 +110,16 @@ def _tags(path: Path, *, pixels: bool = False) -> Any:
         raise ValueError(f"{path.name} is no DICOM file that can be read") from error
 
 
+def _text(tags: Any, name: str) -> str:
+    try:
+        value = tags.get(name)
+    except Exception:  # as above
+        return "damaged"
+    return "" if value is None else str(value)
+
+
 def _number(tags: Any, name: str, default: float | None = None) -> float:
-    if default is not None and tags.get(name) is None:
+    if default is not None and not _text(tags, name):
         return default
     return _numbers(tags, name)[0]
 
@@ -119,13 +127,10 @@ def _number(tags: Any, name: str, default: float | None = None) -> float:
 def _numbers(tags: Any, name: str) -> list[float]:
     try:
         value = tags.get(name)
-        if value is None:
-            raise ValueError(f"DICOM tags do not say {name}: give a geometry of another kind")
         values = [float(part) for part in (value if not isinstance(value, (str, int, float)) else [value])]
-    except (TypeError, ValueError) as error:
-        if "do not say" in str(error):
-            raise
-        raise ValueError(f"DICOM tag {name} must hold numbers") from None
+    except Exception:  # values are made of bytes when they are asked for, and damaged ones fail in many ways
+        said = (name in tags and "hold numbers") or "be there"
+        raise ValueError(f"DICOM tag {name} must {said}: give a geometry of another kind") from None
     if not values or not all(math.isfinite(one) for one in values):
         raise ValueError(f"DICOM tag {name} must hold finite numbers, got {values}")
     return values

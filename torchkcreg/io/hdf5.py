@@ -1,4 +1,7 @@
-"""Projections in HDF5: Data Exchange, NXtomo, or any dataset by name (h5py)."""
+"""Projections in HDF5: Data Exchange, NXtomo, or any dataset by name.
+
+They are read by pyfive: HDF5's own library does not survive some damaged files.
+"""
 
 from __future__ import annotations
 
@@ -33,27 +36,27 @@ def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
 
     Raises:
         ValueError: no HDF5, no such dataset, or several that may be meant.
-        ImportError: h5py is not installed.
+        ImportError: pyfive is not installed.
     """
     try:
-        import h5py
+        import pyfive
     except ImportError:
-        raise ImportError("HDF5 files need h5py: pip install 'torchkcreg[io]'") from None
-    with _opened(h5py, path) as file:
+        raise ImportError("HDF5 files need pyfive: pip install 'torchkcreg[io]'") from None
+    with _opened(pyfive, path) as file:
         stacks: dict[str, Any] = {}
         file.visititems(lambda name, item: stacks.update({name: item}) if getattr(item, "ndim", 0) == 3 else None)
         name = _chosen(stacks, dataset)
         data = stacks[name]
         _check(data, name, path)
         fields: dict[str, NDArray] = {}
-        views = list(range(len(data)))
+        views = list(range(data.shape[0]))
         parent = data.parent
         if name.endswith("exchange/data"):
             for key, kind in (("data_white", "open_beam"), ("data_dark", "dark")):
                 if key in parent:
                     _check(parent[key], key, path)
-                    fields[kind] = _mean(parent[key], range(len(parent[key])))
-        elif "image_key" in parent and parent["image_key"].shape == (len(data),):
+                    fields[kind] = _mean(parent[key], range(parent[key].shape[0]))
+        elif "image_key" in parent and tuple(parent["image_key"].shape) == (data.shape[0],):
             keys = parent["image_key"][()]
             views = np.flatnonzero(keys == _PROJECTION).tolist()
             for number, kind in ((_FLAT, "open_beam"), (_DARK, "dark")):
@@ -61,17 +64,17 @@ def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
                     fields[kind] = _mean(data, np.flatnonzero(keys == number))
 
     def read(indices: Sequence[int]) -> NDArray:
-        with _opened(h5py, path) as again:
+        with _opened(pyfive, path) as again:
             return np.stack([again[name][views[index]] for index in indices])
 
     return Hdf5Images(len(views), read, fields)
 
 
-def _opened(h5py: Any, path: Path) -> Any:
+def _opened(pyfive: Any, path: Path) -> Any:
     try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise ValueError(f"is no HDF5 file that can be read: {str(error).splitlines()[0]}") from error
+        return pyfive.File(str(path))
+    except Exception as error:  # pyfive's own, and what damaged files make of struct
+        raise ValueError(f"is no HDF5 file that can be read: {(str(error).splitlines() or ['damaged'])[0]}") from error
 
 
 def _chosen(stacks: dict[str, Any], dataset: str | None) -> str:
@@ -95,7 +98,7 @@ def _check(data: Any, name: str, path: Path) -> None:
     if data.dtype.kind not in "uif":
         raise ValueError(f"dataset {name} holds no numbers, but {data.dtype}")
     size = path.stat().st_size
-    if data.nbytes > max(_SMALLEST, _MOST_PACKED * size) or data.size == 0:
+    if data.size * data.dtype.itemsize > max(_SMALLEST, _MOST_PACKED * size) or data.size == 0:
         raise ValueError(f"dataset {name} claims {data.shape} numbers, more than a file of {size} bytes can hold")
 
 
