@@ -1,4 +1,4 @@
-# make setup | demo | test | test-full | lint | format | clean        (make help says more)
+# make setup | demo | test | test-full | docs | lint | format | clean        (make help says more)
 #
 # VENV     where the environment is made                    make test VENV=/tmp/kcreg
 # PYTHON   what makes it, Python 3.10 or later              make test PYTHON=python3.12
@@ -11,7 +11,7 @@ VENV ?= .venv
 PYTHON ?= python3
 TORCH ?= torch>=2.10
 TORCH_PIP_FLAGS ?=
-EXTRAS ?= dev,notebooks,simulate
+EXTRAS ?= dev,docs,notebooks,simulate
 JOBS ?= 2
 
 BIN := $(VENV)/bin
@@ -20,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 SOURCES := $(wildcard torchkcreg/csrc/*.cpp torchkcreg/csrc/*.h torchkcreg/csrc/*/*.cpp torchkcreg/csrc/*/*.h)
 PYTEST := OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python -m pytest -n $(JOBS) --doctest-modules torchkcreg tests
 
-.PHONY: help setup demo test test-full lint format clean
+.PHONY: help setup demo test test-full docs lint format clean
 .DEFAULT_GOAL := help
 
 help:
@@ -28,6 +28,7 @@ help:
 	@echo "make demo       simulate a loaded plate, register it, evaluate and draw the result, into demo/"
 	@echo "make test       quick tests and the examples in docstrings"
 	@echo "make test-full  the slow tests too, and those against RTK"
+	@echo "make docs       the documentation as a site, into site/; a broken link is an error"
 	@echo "make lint       ruff, mypy, clang-format; changes nothing"
 	@echo "make format     ruff and clang-format; changes files"
 	@echo "make clean      remove what building and testing leave (demo/ and the environment stay)"
@@ -52,6 +53,9 @@ test: $(STAMP)
 test-full: $(STAMP)
 	$(PIP) --no-build-isolation --editable ".[$(EXTRAS),parity]"
 	$(PYTEST) --no-skips
+
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

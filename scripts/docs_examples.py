@@ -1,0 +1,35 @@
+"""Examples in docstrings, `>>>` lines, as blocks of code on the documentation's pages: an extension of griffe."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import griffe
+
+
+def fenced(text: str) -> str:
+    """A docstring with its doctests between fences; a heading "Example:" over indented ones goes."""
+    lines: list[str] = []
+    inside = headed = False
+    for line in text.splitlines():
+        if line == "Example:":
+            headed = True
+            continue
+        headed = headed and (not line.strip() or line.startswith("    "))
+        shown = line[4:] if headed else line
+        if not inside and shown.startswith(">>> "):
+            lines += ["", "```pycon"]
+            inside = True
+        elif inside and not shown.strip():
+            lines.append("```")
+            inside = False
+        lines.append(shown)
+    return "\n".join([*lines, "```"] if inside else lines)
+
+
+class Examples(griffe.Extension):
+    """Fences the examples of everything that has a docstring."""
+
+    def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
+        if obj.docstring is not None:
+            obj.docstring.value = fenced(obj.docstring.value)
