@@ -33,7 +33,9 @@ def load_figure(
     top, *rows = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": [3, 1, 1]})
     height = carried.heights.cpu().numpy()
     for component, (name, colour) in _MOMENTS.items():
-        moment, std = (x[:, component].cpu().numpy() / 1000 for x in (carried.section_loads, carried.section_std))
+        moment, std = (
+            x[:, component].detach().cpu().numpy() / 1000 for x in (carried.section_loads, carried.section_std)
+        )
         top.fill_between(height, moment - std, moment + std, color=colour, alpha=0.2, linewidth=0)
         top.plot(height, moment, color=colour, label=name)
     for place in carried.hold_heights.tolist():
