@@ -1,10 +1,12 @@
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+from torchkcreg.implant import find_holes
 from torchkcreg.io import read_mesh, write_mesh, write_point_cloud_ply
 
 
@@ -78,7 +80,7 @@ def test_an_unlikely_size_gives_a_warning_with_the_size(tmp_path, plate, factor,
         ("a.obj", b"v 0 0 0\n", "a.obj"),
         ("a.ply", b"ply\nnonsense\n", "a.ply"),
         ("a.3mf", b"PK\x03\x04 this is nothing", "a.3mf cannot be read"),
-        ("a.step", b"ISO-10303-21;", "must be one of .stl"),
+        ("a.igs", b"S 1", "must be one of .stl"),
     ],
 )
 def test_a_file_without_a_mesh_is_refused_by_name(tmp_path, name, content, message):
@@ -118,3 +120,27 @@ def test_a_cloud_that_is_none_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="std must have shape"):
         write_point_cloud_ply(tmp_path / "c.ply", torch.zeros(2, 3), None, torch.zeros(3))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_step_file_is_a_surface_in_mm_whatever_its_unit(tmp_path):
+    pytest.importorskip("cascadio")
+    path = Path(__file__).with_name("plate_with_a_hole.step")
+    plate = read_mesh(path)
+    assert plate.extents == pytest.approx([12, 4, 90], abs=1e-4)
+    assert plate.volume == pytest.approx(12 * 4 * 90 - np.pi * 2.5**2 * 4, rel=1e-5)
+    (hole,) = find_holes(plate)
+    assert hole.radius == pytest.approx(2.5, abs=0.01)
+    metres = path.read_text().replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT($,.METRE.)")
+    (tmp_path / "m.stp").write_text(metres)
+    with pytest.warns(UserWarning, match="probably not in mm"):
+        assert read_mesh(tmp_path / "m.stp").extents == pytest.approx([12000, 4000, 90000], rel=1e-6)
+
+
+def test_a_damaged_step_file_is_refused_and_a_missing_reader_is_named(tmp_path, monkeypatch):
+    pytest.importorskip("cascadio")
+    (tmp_path / "a.step").write_text("ISO-10303-21;\nnothing")
+    with pytest.raises(ValueError, match=r"a.step cannot be read: it .*(STEP file with a body|no surface)"):
+        read_mesh(tmp_path / "a.step")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="need cascadio"):
+        read_mesh(tmp_path / "a.step")

@@ -199,3 +199,17 @@ def test_a_deformation_learns_where_its_screws_are_and_files_know_it(element, ba
     motion.keep_covariance(torch.eye(12, dtype=torch.float64) * 1e-4)
     values = torch.linalg.eigvalsh(deformation.covariance)
     assert float(values.min()) > 0 and int((values - 1e-4).abs().lt(1e-9).sum()) >= 6
+
+
+def test_ways_to_bend_do_not_depend_on_the_sign_of_eigenvectors(bar, element, monkeypatch) -> None:
+    """Which is another one from library to library, and from processor to processor."""
+    eigh = torch.linalg.eigh
+
+    def turned(matrix):
+        values, vectors = eigh(matrix)
+        return values, vectors * torch.tensor([-1.0, 1.0]).repeat(vectors.shape[1])[: vectors.shape[1]]
+
+    monkeypatch.setattr(torch.linalg, "eigh", turned)
+    other = Superelement.of(bar, STEEL, HOLDS)
+    torch.testing.assert_close(other.loads, element.loads, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(other.nodal, element.nodal, rtol=1e-5, atol=1e-7)

@@ -23,7 +23,7 @@ def found() -> tuple[RegistrationResult, torch.Tensor, torch.Tensor]:
     implant = Implant(plate(), material="titanium", holds=HOLDS)
     truth = build_scene(implant, CONFIG)
     bent = truth.assemblies[0].deformation
-    bent.amounts.data[:2] = torch.tensor([0.4, -0.2]).double()
+    bent.amounts.data[:2] = torch.tensor([-0.4, -0.2]).double()
     result = register(implant, image(truth), CONFIG)
     return result, bent.loads, truth.assemblies[0].warp(plate().points).detach()
 

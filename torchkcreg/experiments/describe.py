@@ -32,7 +32,7 @@ from torchkcreg.visualization import geometry_figure
 
 from .describe_run import describe_run
 
-_MESHES = (".stl", ".obj", ".ply", ".off", ".3mf")
+_MESHES = (".stl", ".obj", ".ply", ".off", ".3mf", ".step", ".stp")
 _VOLUMES = (".mha", ".mhd", ".nrrd", ".nii", ".gz")
 _STACKS = (".tif", ".tiff", ".png", ".h5", ".hdf5", ".hdf", ".nxs")
 

@@ -13,19 +13,21 @@ from torch import Tensor
 
 from torchkcreg.implant import closed_mesh, scanned_surface
 from torchkcreg.io.files import atomic_path, existing_file
+from torchkcreg.io.step import STEP_SUFFIXES, load_step
 from torchkcreg.io.stl import load_stl
 from torchkcreg.io.volumes import VOLUME_SUFFIXES, read_volume
 
-MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".3mf")
+WRITTEN_SUFFIXES = (".stl", ".obj", ".ply", ".off")
+MESH_SUFFIXES = (*WRITTEN_SUFFIXES, ".3mf", *STEP_SUFFIXES)
 _METRES_MM, _SMALLEST_MM, _LARGEST_MM = 1.0, 20.0, 1000.0
 
 
 def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
-    """The closed surface of an STL, OBJ, PLY, OFF or 3MF file, in mm, oriented outwards.
+    """The closed surface of an STL, OBJ, PLY, OFF, 3MF or STEP file, in mm, oriented outwards.
 
     Of a volume (MHA, NRRD, NIfTI), a bench scan of the implant, it is the surface where values are half of the metal's,
     in the volume's world; see `scanned_surface`.
-    3MF says its unit and is converted (it needs the package lxml); the others are taken to be in mm.
+    3MF and STEP say their unit and are converted (extras io and cad); the others are taken to be in mm.
     Equal vertices are merged, faces that this collapses dropped; several bodies in one file are one surface. A largest
     extent under 1, under 20 or over 1000 mm gives a warning: the file is probably in metres, in cm or inches, or not in
     mm.
@@ -41,13 +43,12 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     if suffix not in MESH_SUFFIXES:
         raise ValueError(f"mesh file {path} must be one of {', '.join((*MESH_SUFFIXES, *VOLUME_SUFFIXES))}")
     try:
-        stl = suffix == ".stl"
-        mesh = load_stl(path.read_bytes()) if stl else trimesh.load(str(path), force="mesh", process=False)
+        mesh = _loaded(path, suffix)
     except Exception as error:  # each of trimesh's parsers fails in its own way
         hint = " (3MF needs the package lxml)" if suffix == ".3mf" and _lacks("lxml") else ""
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ValueError(f"mesh file {path} cannot be read: {reason}{hint}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+    if len(mesh.faces) == 0:
         raise ValueError(f"mesh file {path} holds no triangles")
     try:
         closed = closed_mesh(mesh)
@@ -57,6 +58,18 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         closed.apply_scale(trimesh.units.unit_conversion(mesh.units, "millimeters"))
     _warn_about_size(path, closed)
     return closed
+
+
+def _loaded(path: Path, suffix: str) -> trimesh.Trimesh:
+    """The mesh of a file, as it is."""
+    if suffix == ".stl":
+        return load_stl(path.read_bytes())
+    if suffix in STEP_SUFFIXES:
+        return load_step(path)
+    mesh = trimesh.load(str(path), force="mesh", process=False)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise ValueError("it holds no triangles")
+    return mesh
 
 
 def _surface_of_volume(path: Path) -> trimesh.Trimesh:
@@ -72,8 +85,8 @@ def _surface_of_volume(path: Path) -> trimesh.Trimesh:
 def write_mesh(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:
     """Nothing; writes a surface, its format chosen by the suffix (.stl, .obj, .ply, .off)."""
     suffix = Path(path).suffix.lower()
-    if suffix not in MESH_SUFFIXES[:-1]:
-        raise ValueError(f"meshes are written as {', '.join(MESH_SUFFIXES[:-1])}, got {path}")
+    if suffix not in WRITTEN_SUFFIXES:
+        raise ValueError(f"meshes are written as {', '.join(WRITTEN_SUFFIXES)}, got {path}")
     with atomic_path(path) as temporary:
         mesh.export(str(temporary), file_type=suffix[1:])
 

@@ -108,6 +108,7 @@ class Superelement:
         mapped = balanced * scale
         values, vectors = torch.linalg.eigh(mapped @ (flat @ flat.T) @ mapped.T)
         values, ways = values.flip(0).clamp_min(0).sqrt(), vectors.flip(1).T @ mapped
+        ways = ways * _senses(ways @ moved.flatten(1))
         kept = int((values > negligible_mm).sum().clamp_min(1))
         ways, stiff, expected = ways[:kept] / values[:kept, None], ways[kept:], values[:kept]
         sections = Sections.along(coarse, _STATIONS)
@@ -211,6 +212,17 @@ def _numbers(value: Any) -> Tensor:
 
 def _with_tuples(content: dict[str, Any]) -> dict[str, Any]:
     return {key: tuple(value) if isinstance(value, list) else value for key, value in content.items()}
+
+
+def _senses(displacements: Tensor) -> Tensor:
+    """1 or -1 (A, 1) for each of displacements (A, N): where it is largest it shall be positive.
+
+    Eigenvectors have no sense of their own, and libraries and processors give them one or the other. Of equal ones, as
+    the ends of a symmetric implant have, a later one counts as larger.
+    """
+    rising = torch.linspace(1.0, 1.01, displacements.shape[1], dtype=displacements.dtype, device=displacements.device)
+    largest = (displacements.abs() * rising).argmax(1, keepdim=True)
+    return displacements.gather(1, largest).sign()
 
 
 def _balanced(holds: Sequence[Hold], scale: Tensor) -> Tensor:
