@@ -8,7 +8,7 @@ nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parent.parent / "notebooks").glob("*.ipynb"))
-LONG = ("03_tibial_plate", "04_femoral_plate")  # whole experiments: minutes
+LONG = ("03_tibial_plate", "04_femoral_plate", "10_load_and_uncertainty")  # whole experiments: minutes
 
 
 def test_there_are_notebooks():

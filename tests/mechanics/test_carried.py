@@ -72,9 +72,9 @@ def test_surface_stress_is_that_of_a_beam(element, four_point) -> None:
     wanted = (112.5**2 + 3 * twisted**2) ** 0.5
     assert value.tolist() == pytest.approx([wanted] * 3, rel=0.06)
     generator = torch.Generator().manual_seed(0)
-    draws = torch.randn(400, len(four_point), generator=generator, dtype=torch.float64) * covariance.diagonal().sqrt()
+    draws = torch.randn(80, len(four_point), generator=generator, dtype=torch.float64) * covariance.diagonal().sqrt()
     drawn = torch.stack([node_stresses(element, points, four_point + d, covariance)[0] for d in draws])
-    torch.testing.assert_close(deviation, drawn.std(0), rtol=0.2, atol=0.5)
+    torch.testing.assert_close(deviation, drawn.std(0), rtol=0.25, atol=0.5)
 
 
 def test_cubes_with_little_metal_do_not_invent_stress() -> None:

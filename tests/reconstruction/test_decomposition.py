@@ -57,6 +57,7 @@ def test_rods_are_recovered_beside_a_plate(scan):
     assert found.mask is not None and float(found.water.min()) >= 0
 
 
+@pytest.mark.slow
 def test_tissue_lighter_than_water_is_no_lack_of_calcium(scan):
     """One voltage cannot tell light tissue from less calcium; two can."""
     geometry, _ = scan

@@ -18,7 +18,7 @@ from .spectral import BeamModel
 from .system import VoxelSystem, projected
 
 FEWEST_PIXELS = 200
-MOST_PIXELS = 20000
+MOST_PIXELS = 5000
 LEAST_MM = 0.5  # of metal in a pixel that is used
 LEAST_PER_MM = 0.1  # attenuation of the lightest implant alloys, 1/mm, less than that
 STEEPEST = 0.15  # change of the metal's length to the next pixel, as a share: rims are averages of exponentials
