@@ -14,7 +14,7 @@ from torchkcreg.io import read_components, read_geometry, read_points, read_proj
 
 FIGURES = {"overlay.png", "displacement.png", "history.png", "overlay.npz", "report.html"}
 RUN_FILES = {"config.yaml", "versions.json", "checkpoint.pt", "history.json", "metrics.json", "deformation.json"}
-EXPORTS = {"dvf.mha", "bspline.tfm", "implant_deformed.ply", "arrays.npz", "uncertainty.json"}
+EXPORTS = {"dvf.mha", "bspline.tfm", "implant_deformed.ply", "implant_deformed.vtp", "arrays.npz", "uncertainty.json"}
 
 
 def command(case, out, **changes):

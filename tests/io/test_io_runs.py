@@ -14,7 +14,14 @@ from torchkcreg.plain import plain
 from torchkcreg.registration import RegisteredImplant, RegistrationConfig, RegistrationResult
 from torchkcreg.splines import ControlPointGrid
 
-RESULT_FILES = {"deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply", "history.json"}
+RESULT_FILES = {
+    "deformation.json",
+    "dvf.mha",
+    "bspline.tfm",
+    "implant_deformed.ply",
+    "implant_deformed.vtp",
+    "history.json",
+}
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
 from .versions import versions
 from .volumes import read_volume, write_volume
-from .vtu import write_surface_vtu
+from .vtk_xml import write_points_vtp, write_surface_vtu
 
 __all__ = [
     "LAYERS",
@@ -69,6 +69,7 @@ __all__ = [
     "write_mesh",
     "write_point_cloud_ply",
     "write_points",
+    "write_points_vtp",
     "write_projections",
     "write_rtk",
     "write_spectrum",

@@ -55,6 +55,20 @@ def write_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
         np.savez_compressed(file, **{name: array.detach().cpu().numpy() for name, array in arrays.items()})  # type: ignore[arg-type]
 
 
+def require_loadable(content: Any, where: str) -> None:
+    """Nothing; ValueError where content of a checkpoint, at a place in it, is more than tensors and plain data."""
+    if content is None or isinstance(content, (bool, int, float, str)) or type(content) is torch.Tensor:
+        return
+    if isinstance(content, dict):
+        for key, value in content.items():
+            require_loadable(value, f"{where}[{key!r}]")
+    elif isinstance(content, (list, tuple)):
+        for i, value in enumerate(content):
+            require_loadable(value, f"{where}[{i}]")
+    else:
+        raise ValueError(f"a checkpoint holds tensors and plain data, but {where} is a {type(content).__name__}")
+
+
 def _array(path: Path, name: str) -> Tensor:
     if not path.is_file():
         raise FileNotFoundError(f"arrays file {path}, which a deformation refers to, does not exist")

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from torchkcreg.deformation import SplineField
 from torchkcreg.geometry import transform_points
-from torchkcreg.io.arrays import with_arrays, without_arrays, write_arrays
+from torchkcreg.io.arrays import require_loadable, with_arrays, without_arrays, write_arrays
 from torchkcreg.io.config import write_config
 from torchkcreg.io.figures import write_figure
 from torchkcreg.io.files import TEMPORARY_PREFIX, atomic_path, read_json, write_json
 from torchkcreg.io.meshes import write_point_cloud_ply
 from torchkcreg.io.transforms import warp, write_displacement_field, write_itk_transform
 from torchkcreg.io.versions import versions
+from torchkcreg.io.vtk_xml import write_points_vtp
 from torchkcreg.plain import plain
 from torchkcreg.registration import RegistrationResult
 
@@ -29,9 +30,9 @@ if TYPE_CHECKING:
 CONFIG, VERSIONS, HISTORY, METRICS = "config.yaml", "versions.json", "history.json", "metrics.json"
 DEFORMATION, FIELD, TRANSFORM, CLOUD = "deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply"
 CHECKPOINT, ARRAYS, UNCERTAINTY = "checkpoint.pt", "arrays.npz", "uncertainty.json"
-SEEDS, LAYERS, REPORT = "seeds", "overlay.npz", "report.html"
+SEEDS, LAYERS, REPORT, VTK_CLOUD = "seeds", "overlay.npz", "report.html", "implant_deformed.vtp"
 FIGURES = ("overlay.png", "displacement.png", "history.png")
-_RESULT_FILES = (DEFORMATION, METRICS, UNCERTAINTY, FIELD, TRANSFORM, CLOUD, ARRAYS)
+_RESULT_FILES = (DEFORMATION, METRICS, UNCERTAINTY, FIELD, TRANSFORM, CLOUD, VTK_CLOUD, ARRAYS)
 RUN_FILES = (CONFIG, VERSIONS, HISTORY, CHECKPOINT, *_RESULT_FILES, *FIGURES, LAYERS, REPORT)
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -51,7 +52,7 @@ class RunFolder:
     | `uncertainty.json` | expected errors, see `uncertainty_of` |
     | `dvf.mha` | displacement field, see `displacement_field` |
     | `bspline.tfm` | ITK transform, see `itk_transform` |
-    | `implant_deformed.ply` | the deformed point cloud with the displacement and the expected error of each node |
+    | `implant_deformed.ply`, `.vtp` | deformed point cloud with the displacement and expected error of each node |
     | `overlay.png`, `displacement.png`, `history.png` | figures |
     | `overlay.npz`, `report.html` | views with and without the implant, and the page that shows them |
     | `seeds/<seed>/` | a run folder of each seed, where several were run |
@@ -109,7 +110,7 @@ class RunFolder:
         Raises:
             ValueError: something in it is neither a tensor nor plain data, and where; it could not be loaded safely.
         """
-        _require_loadable(state, "state")
+        require_loadable(state, "state")
         with atomic_path(self.path / CHECKPOINT) as temporary:
             torch.save(state, temporary)
 
@@ -174,6 +175,8 @@ class RunFolder:
                 write_itk_transform(self.path / f"{prefix}{TRANSFORM}", pose, deformation)
             std = None if implant.deviations is None else implant.deviations.of_nearest(nodes)
             write_point_cloud_ply(self.path / f"{prefix}{CLOUD}", moved, displacement, std)
+            error = {} if std is None else {"expected_error_mm": std}
+            write_points_vtp(self.path / f"{prefix}{VTK_CLOUD}", moved, {"displacement_mm": displacement, **error})
         if any(implant.deviations is not None for implant in result.implants):
             write_json(self.path / UNCERTAINTY, uncertainty_of(result))
         if arrays:
@@ -198,7 +201,7 @@ class RunFolder:
             leftover.unlink(missing_ok=True)
         for name in names:
             (self.path / name).unlink(missing_ok=True)
-        for name in (FIELD, TRANSFORM, CLOUD) if names else ():  # of further implants
+        for name in (FIELD, TRANSFORM, CLOUD, VTK_CLOUD) if names else ():  # of further implants
             for path in self.path.glob(f"*_{name}"):
                 path.unlink()
         if names:
@@ -243,16 +246,3 @@ def read_run(path: str | os.PathLike[str]) -> RegistrationResult:
         reasons = "; ".join(result.warnings)
         warnings.warn(f"the registration in {path} is {result.status}: {reasons}", stacklevel=2)
     return result
-
-
-def _require_loadable(content: Any, where: str) -> None:
-    if content is None or isinstance(content, (bool, int, float, str)) or type(content) is torch.Tensor:
-        return
-    if isinstance(content, dict):
-        for key, value in content.items():
-            _require_loadable(value, f"{where}[{key!r}]")
-    elif isinstance(content, (list, tuple)):
-        for i, value in enumerate(content):
-            _require_loadable(value, f"{where}[{i}]")
-    else:
-        raise ValueError(f"a checkpoint holds tensors and plain data, but {where} is a {type(content).__name__}")
