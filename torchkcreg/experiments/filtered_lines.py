@@ -28,6 +28,17 @@ def line_integrals(inputs: ReconstructionInputs, options: ReconstructionOptions)
     return inpainted(lines, metal, mask=inputs.mask)
 
 
+def counted(lines: Tensor) -> Callable[[list[int]], Tensor]:
+    """Views (V, rows, cols) as they are asked for, with a bar that shows how many there were."""
+    bar = progress_bar(total=len(lines), desc="views")
+
+    def read(views: list[int]) -> Tensor:
+        bar.update(len(views))
+        return lines[views]
+
+    return read
+
+
 def streamed(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Callable[[list[int]], Tensor]:
     """The same of views as they are asked for, with a bar that shows how many there were."""
     bar = progress_bar(total=inputs.geometry.num_views, desc="views")

@@ -29,7 +29,7 @@ from torchkcreg.reconstruction import (
 )
 from torchkcreg.visualization import beam_figure, reconstruction_figure
 
-from .filtered_lines import line_integrals, streamed
+from .filtered_lines import counted, line_integrals, streamed
 from .processes import processes
 from .reconstruction_inputs import ReconstructionInputs, read_reconstruction_inputs
 from .reconstruction_options import ReconstructionFiles, ReconstructionOptions
@@ -112,7 +112,7 @@ def _reconstructed(
     geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
     if options.is_filtered:
         ramp = FDKConfig(window=options.window)
-        lines = line_integrals(inputs, options) if inputs.file is None else streamed(inputs, options)
+        lines = counted(line_integrals(inputs, options)) if inputs.file is None else streamed(inputs, options)
         return [(fdk(lines, geometry, grid, config=ramp, shard=shard, backend=backend), grid)], []
     changes = {name: getattr(options, name) for name in ("iterations", "subsets") if getattr(options, name) is not None}
     config = PWLSConfig.preset(options.preset, beta=options.beta, **changes)

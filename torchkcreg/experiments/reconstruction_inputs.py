@@ -150,6 +150,7 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
                 mask=projections.mask,
                 alloys=alloys,
                 soft_tissue=options.soft_tissue,
+                progress=None,
                 backend=options.backend,
             )
 

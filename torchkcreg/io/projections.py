@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from torchkcreg.io.files import atomic_path, existing_place
+from torchkcreg.io.files import atomic_path, existing_place, physical_memory
 from torchkcreg.io.image_series import open_series
 from torchkcreg.io.measured import Projections, converted
 from torchkcreg.io.plausible import ImageHeader, implausible_images
@@ -70,6 +71,14 @@ def read_projections(
     return replace(projections, header=header)
 
 
+def _check_room(path: Path) -> None:
+    """Nothing; ValueError where an archive unpacks to more than this machine's memory."""
+    with zipfile.ZipFile(path) as archive:
+        needed = sum(item.file_size for item in archive.infolist() if item.filename.removesuffix(".npy") in _ARRAYS)
+    if needed > (memory := physical_memory()):
+        raise ValueError(f"unpacks to {needed / 2**30:.0f} GiB, this machine has {memory / 2**30:.0f} GiB of memory")
+
+
 def write_projections(
     path: str | os.PathLike[str],
     *,
@@ -99,6 +108,7 @@ def _load(path: Path) -> tuple[dict[str, NDArray], ImageHeader | None]:
             if isinstance(loaded, np.ndarray):  # an array under an archive's name
                 return {"image": loaded}, None
             with loaded as file:
+                _check_room(path)
                 return {key: file[key] for key in _ARRAYS if key in file.files}, None
         series = open_series(path)
         return series.arrays(range(series.num_views)), series.header

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.physics import Beam, Spectrum, Veil, material, tungsten_spectrum
+from torchkcreg.progress import progress_bar
 from torchkcreg.scene import KnownComponent
 
 from .corrections import scatter_image
@@ -83,6 +84,7 @@ def estimate_beam(
     alloys: Sequence[str] = (),
     soft_tissue: float | None = None,
     backend: str = "auto",
+    progress: bool | None = False,
 ) -> BeamEstimate:
     """The beam, and the metals' attenuation in it, that explain what known metal lets through.
 
@@ -103,6 +105,7 @@ def estimate_beam(
         soft_tissue: Attenuation over water of what most of the object is, where that is known: 1 in a water bath. It
             fixes the scale of all attenuation, which the metal's shadow leaves free within a per cent or two.
         backend: Of the projectors.
+        progress: Show a bar over the spectra and alloys that are tried; None: on a terminal only.
 
     Raises:
         ValueError: If there are no components, or too few pixels behind metal to tell.
@@ -118,7 +121,8 @@ def estimate_beam(
     shadow = metal_shadow(transmission - veil, veil, metal, unknown, geometry, grid, start, mask, backend)
     spectra = {None: spectrum} if spectrum is not None else {kvp: tungsten_spectrum(kvp) for kvp in TUBE_KVP}
     metals = list(itertools.product(*(dict.fromkeys([name, *alloys]) for name in known_materials(components))))
-    fits = [_fitted(shadow, one, kvp, names, soft_tissue) for kvp, one in spectra.items() for names in metals]
+    tried = progress_bar(list(itertools.product(spectra.items(), metals)), desc="beam", shown=progress)
+    fits = [_fitted(shadow, one, kvp, names, soft_tissue) for (kvp, one), names in tried]
     best = min(fits, key=lambda fit: fit.cost)
     for doubt in _doubts(best, shadow):
         warnings.warn(f"the estimated beam is doubtful: {doubt}", stacklevel=2)
