@@ -191,6 +191,6 @@ def test_writing_needs_one_kind_of_image_and_an_npz(tmp_path):
 
 def test_an_archive_that_unpacks_to_more_than_memory_is_refused(tmp_path, monkeypatch):
     write_projections(tmp_path / "p.npz", line_integrals=np.zeros((40, 64, 64), np.float32))
-    monkeypatch.setattr("torchkcreg.io.projections.physical_memory", lambda: 640_000.0)
+    monkeypatch.setattr("torchkcreg.io.scans.projections.physical_memory", lambda: 640_000.0)
     with pytest.raises(ValueError, match=r"p.npz: cannot be read: unpacks to 0 GiB, this machine has 0 GiB of memory"):
         read_projections(tmp_path / "p.npz")

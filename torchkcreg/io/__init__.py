@@ -12,16 +12,13 @@ from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write
 from .init import read_init, write_init
 from .layers import read_layers, write_layers
 from .matrix_tables import read_matrix_table, write_matrix_table
-from .measured import Projections
 from .meshes import read_mesh, write_mesh, write_point_cloud_ply
-from .plausible import implausible_magnification
 from .point_cloud_ply import read_point_cloud_ply
 from .points import read_points, write_points
-from .projection_file import ProjectionFile
-from .projections import read_projections, write_projections
 from .references import read_reference
 from .rtk_geometry import read_rtk, write_rtk
 from .runs import LAYERS, REPORT, RunFolder, read_run
+from .scans import ProjectionFile, Projections, implausible_magnification, read_projections, write_projections
 from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
 from .versions import versions

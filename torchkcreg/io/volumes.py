@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid
 from torchkcreg.io.files import atomic_path, existing_file
-from torchkcreg.io.images import read_image
+from torchkcreg.io.scans import read_image
 
 VOLUME_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nii", ".nii.gz")
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchkcreg.io.dicom import DICOM_SUFFIXES, dicom_images, instance_number
-from torchkcreg.io.hdf5 import HDF5_SUFFIXES, open_hdf5
-from torchkcreg.io.images import num_slices, read_image, read_slices
-from torchkcreg.io.pages import PAGE_SUFFIXES, num_pages, read_pages
-from torchkcreg.io.plausible import ImageHeader
-from torchkcreg.io.scan_description import DESCRIPTION_SUFFIXES, Described, read_description
+from torchkcreg.io.scans.dicom import DICOM_SUFFIXES, dicom_images, instance_number
+from torchkcreg.io.scans.hdf5 import HDF5_SUFFIXES, open_hdf5
+from torchkcreg.io.scans.images import num_slices, read_image, read_slices
+from torchkcreg.io.scans.pages import PAGE_SUFFIXES, num_pages, read_pages
+from torchkcreg.io.scans.plausible import ImageHeader
+from torchkcreg.io.scans.scan_description import DESCRIPTION_SUFFIXES, Described, read_description
 
 STACK_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nii", ".nii.gz")
 VIEW_SUFFIXES = (*STACK_SUFFIXES, *PAGE_SUFFIXES, *DICOM_SUFFIXES)  # of which a folder may hold one file a view

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.io.plausible import ImageHeader, stuck_pixels
+from torchkcreg.io.scans.plausible import ImageHeader, stuck_pixels
 from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
 
 RELATIVE_FLOOR = 1e-6

@@ -11,7 +11,7 @@ import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
 
-from torchkcreg.io.meta_header import META_SUFFIXES, check_meta_header
+from torchkcreg.io.scans.meta_header import META_SUFFIXES, check_meta_header
 
 _MOST_PACKED = 5000  # how many times larger than its file an image can be: deflate and LZW pack less
 _SMALLEST = 1 << 16  # bytes: what is not worth the question

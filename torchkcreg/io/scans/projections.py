@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchkcreg.io.files import atomic_path, existing_place, physical_memory
-from torchkcreg.io.image_series import open_series
-from torchkcreg.io.measured import Projections, converted
-from torchkcreg.io.plausible import ImageHeader, implausible_images
+from torchkcreg.io.scans.image_series import open_series
+from torchkcreg.io.scans.measured import Projections, converted
+from torchkcreg.io.scans.plausible import ImageHeader, implausible_images
 
 log = logging.getLogger(__name__)
 _ARRAYS = ("intensity", "open_beam", "line_integrals", "mask", "saturation", "dark")

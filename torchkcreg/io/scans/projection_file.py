@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from numpy.typing import ArrayLike
 
 from torchkcreg.io.files import existing_place
-from torchkcreg.io.image_series import open_series
-from torchkcreg.io.measured import Projections, check_views, converted
+from torchkcreg.io.scans.image_series import open_series
+from torchkcreg.io.scans.measured import Projections, check_views, converted
 
 
 class ProjectionFile:

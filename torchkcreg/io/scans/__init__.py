@@ -1,0 +1,20 @@
+"""Projections as they are measured: files and folders of images of many kinds, to line integrals with a mask."""
+
+from .dicom import DICOM_SUFFIXES, read_dicom_geometry
+from .images import image_header, read_image
+from .measured import Projections
+from .plausible import implausible_magnification
+from .projection_file import ProjectionFile
+from .projections import read_projections, write_projections
+
+__all__ = [
+    "DICOM_SUFFIXES",
+    "ProjectionFile",
+    "Projections",
+    "image_header",
+    "implausible_magnification",
+    "read_dicom_geometry",
+    "read_image",
+    "read_projections",
+    "write_projections",
+]
