@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from torchkcreg.io import write_points_vtp, write_surface_vtu
+from torchkcreg.io import write_point_cloud_ply, write_points_vtp, write_surface_vtu
 
 POINTS = torch.rand(7, 3, generator=torch.Generator().manual_seed(0))
 
@@ -38,6 +38,11 @@ def test_vtk_reads_both(tmp_path):
     write_points_vtp(tmp_path / "p.vtp", POINTS, {"displacement_mm": 2 * POINTS, "expected_error_mm": POINTS[:, 0]})
     box = trimesh.creation.box((1.0, 2.0, 3.0))
     write_surface_vtu(tmp_path / "s.vtu", box, {"stress": torch.arange(8.0)})
+    write_point_cloud_ply(tmp_path / "p.ply", POINTS, 2 * POINTS, POINTS[:, 0])
+    cloud = vtk.vtkPLYReader()
+    cloud.SetFileName(str(tmp_path / "p.ply"))
+    cloud.Update()
+    np.testing.assert_allclose(vtk_to_numpy(cloud.GetOutput().GetPoints().GetData()), POINTS.numpy())
     for reader, path in ((vtk.vtkXMLPolyDataReader(), "p.vtp"), (vtk.vtkXMLUnstructuredGridReader(), "s.vtu")):
         reader.SetFileName(str(tmp_path / path))
         reader.Update()

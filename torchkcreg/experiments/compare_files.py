@@ -20,6 +20,8 @@ from torchkcreg.plain import plain
 from torchkcreg.registration import RegisteredImplant
 from torchkcreg.visualization import comparison_figure
 
+from .report_files import write_report
+
 _PITCH_MM = 1.0
 _COLUMNS = tuple(
     f"{what}_{axis.replace(' ', '_')}_{unit}"
@@ -144,6 +146,7 @@ def compare_files(
     write_text(out / "compare.csv", found.table())
     if figures:
         write_figure(out / "compare.png", comparison_figure(motions, [Path(n).name for n in names], loads))
+        write_report(out)
     return found
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import TwoLevelGrid, VolumeGrid
-from torchkcreg.io import RunFolder, read_config, read_volume, write_volume
+from torchkcreg.io import REPORT, RunFolder, read_config, read_volume, write_volume
 from torchkcreg.physics import material
 from torchkcreg.reconstruction import (
     PWLS,
@@ -33,12 +33,14 @@ from .filtered_lines import counted, line_integrals, streamed
 from .processes import processes
 from .reconstruction_inputs import ReconstructionInputs, read_reconstruction_inputs
 from .reconstruction_options import ReconstructionFiles, ReconstructionOptions
+from .report_files import write_report
 
 CHECKPOINT_EVERY = 5
 OUTPUTS = (
     *(f"{level}{kind}.mha" for level in ("", "near_metal_") for kind in ("volume", "volume_hu", "with_implant")),
     "slices.png",
     "beam.png",
+    REPORT,
 )
 
 
@@ -66,7 +68,7 @@ def reconstruct_files(
     The folder holds ``volume.mha`` in 1/mm (behind known components the background alone; of a single material the
     share of it, and no CT numbers), ``volume_hu.mha``,
     ``with_implant.mha`` (with known components), the same three as ``near_metal_...`` where voxels near the metal are
-    divided, ``metrics.json``, ``config.yaml``, ``slices.png``
+    divided, ``metrics.json``, ``config.yaml``, ``slices.png``, ``report.html``
     and, of an estimated beam, ``beam.png``. Under
     ``torchrun`` the views are shared out over the processes and the first one writes.
 
@@ -211,6 +213,8 @@ def _write(
         window = (0.0, 1.2 if shares else 2 * beam.water)
         run.write_figure("slices.png", _slices(inputs, *levels[-1], whole, window))
     run.write_metrics(metrics)
+    if figures:
+        write_report(run.path)
 
 
 def _with_implant(inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid) -> Tensor:
