@@ -97,7 +97,7 @@ def test_other_folders_of_results_have_a_page_too(tmp_path, capsys):
     assert main(["report", str(tmp_path), "--out", str(tmp_path / "page.html")]) == 0
     page = (tmp_path / "page.html").read_text()
     assert str(tmp_path / "page.html") in capsys.readouterr().out
-    assert "6 x 5 x 4" in page and "12 s" in page
+    assert "6 x 5 x 4" in page and "12 s" in page and "<h1>Comparison: " in page
     assert "rotation x deg" in page and "1.25" in page and "0.04" in page
     assert '<div class="verdict' not in page
 
@@ -125,3 +125,13 @@ def test_point_clouds_come_back_and_damaged_ones_are_told(tmp_path):
         (tmp_path / "b.ply").write_bytes(broken)
         with pytest.raises(ValueError, match=reason):
             read_point_cloud_ply(tmp_path / "b.ply")
+
+
+def test_a_reconstructions_page_says_what_was_found_of_scatter_beam_and_metal(tmp_path):
+    (tmp_path / "volume.mha").touch()
+    metrics = {"scatter": {"fraction": 0.4}, "beam": {"kvp": 90.0, "scales": [1.02]}, "components": ["steel", "steel"]}
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics))
+    page = write_report(tmp_path).read_text(encoding="utf-8")
+    assert "<h1>Reconstruction: " in page and "scatter: fraction" in page and "estimated beam: kvp" in page
+    assert "known metal" in page and "steel, steel" in page
+    assert "expected error" not in page  # of none of these

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def write_report(folder: Path, *, out: Path | None = None) -> Path:
     scene = implant_scene(*_clouds(folder), views=_views(folder)) if is_run else None
     versions = _read(folder / "versions.json")
     page = Page(
-        f"{'Registration' if is_run else 'Results'}: {folder.resolve().name}",
+        f"{_kind(folder)}: {folder.resolve().name}",
         verdict=metrics.get("status") if is_run else None,
         summary=_summary(metrics) if is_run else "",
         warnings=[str(text) for text in metrics.get("warnings") or []],
@@ -91,6 +92,17 @@ def write_report(folder: Path, *, out: Path | None = None) -> Path:
     target = out or folder / REPORT
     write_text(target, page_html(page))
     return target
+
+
+def _kind(folder: Path) -> str:
+    kinds = {
+        "deformation.json": "Registration",
+        "volume.mha": "Reconstruction",
+        "compare.json": "Comparison",
+        "load.json": "What the implant carries",
+        "densitometry.json": "Bone mineral",
+    }
+    return next((kind for name, kind in kinds.items() if (folder / name).is_file()), "Results")
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -141,6 +153,11 @@ def _scalar_rows(metrics: dict[str, Any]) -> list[Row]:
     if isinstance(metrics.get("shape"), list) and isinstance(metrics.get("spacing_mm"), list):
         size = " x ".join(str(count) for count in reversed(metrics["shape"]))
         rows.insert(0, Row("voxels", size, about=f"of {' x '.join(f'{x:g}' for x in metrics['spacing_mm'])} mm"))
+    for name, title in (("scatter", "scatter"), ("beam", "estimated beam")):
+        if isinstance(metrics.get(name), dict):
+            rows += [replace(row, name=f"{title}: {row.name}") for row in _nested_rows(metrics[name])]
+    if metrics.get("components"):
+        rows.append(Row("known metal", str(len(metrics["components"])), about=", ".join(metrics["components"])))
     return rows
 
 

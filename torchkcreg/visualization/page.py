@@ -111,12 +111,14 @@ def _verdict(page: Page) -> str:
 def _table(rows: Sequence[Row]) -> str:
     if not rows:
         return ""
+    errors = any(row.deviation for row in rows)  # a column that nothing stands in is none
     lines = [
         f"<tr><td>{escape(row.name)}{f'<small>{escape(row.about)}</small>' if row.about else ''}</td>"
-        f'<td class="number">{escape(row.value)}</td><td class="number">{escape(row.deviation)}</td></tr>'
+        f'<td class="number">{escape(row.value)}</td>'
+        f"{f'<td class=number>{escape(row.deviation)}</td>' if errors else ''}</tr>"
         for row in rows
     ]
-    head = '<tr><th></th><th class="number">value</th><th class="number">expected error</th></tr>'
+    head = f'<tr><th></th><th class="number">value</th>{"<th class=number>expected error</th>" if errors else ""}</tr>'
     return f'<section><h2>Numbers</h2><div class="wide"><table>{head}{"".join(lines)}</table></div></section>'
 
 
