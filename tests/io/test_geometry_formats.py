@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
+import trimesh
 
 from torchkcreg.cli import main
 from torchkcreg.geometry import (
@@ -21,7 +22,16 @@ from torchkcreg.geometry import (
     to_astra,
     to_leap,
 )
-from torchkcreg.io import read_geometry, read_rtk, read_run, write_geometry, write_rtk
+from torchkcreg.io import (
+    read_geometry,
+    read_mesh,
+    read_projections,
+    read_rtk,
+    read_run,
+    write_geometry,
+    write_mesh,
+    write_rtk,
+)
 
 SIZE = {"det_shape": (20, 31), "pixel_spacing": (0.8, 1.2)}
 GEOMETRY = circular_geometry(range(0, 360, 30), sad=404, sdd=538, det_offset_mm=(3, -2), source_z_mm=7.0, **SIZE)
@@ -245,3 +255,21 @@ def test_a_registration_from_rtks_geometry_and_a_stack_is_that_from_json(small_c
         assert main(["register", *arguments]) in (0, 3)
         moved[name] = read_run(tmp_path / name).warp(torch.tensor([[0.0, 0.0, 30.0], [0.0, 0.0, -30.0]]))
     assert torch.allclose(moved["rtk"], moved["json"], atol=0.01)
+
+
+def test_meshes_and_projections_are_converted_by_the_targets_ending(tmp_path, capsys):
+    counts = np.full((3, 6, 7), 1000.0, np.float32)
+    counts[1, 2, 3] = np.nan
+    np.save(tmp_path / "scan.npy", counts)
+    flags = ["--open-beam", "2000", "--pixel-pitch", "0.5", "0.4"]
+    assert main(["convert", str(tmp_path / "scan.npy"), str(tmp_path / "lines.mha"), *flags]) == 0
+    assert "3 views of 6 x 7 pixels" in capsys.readouterr().out
+    found = read_projections(tmp_path / "lines.mha")
+    assert found.num_masked == {"not finite": 1} and not found.mask[1, 2, 3]
+    assert float(found.line_integrals[0, 0, 0]) == pytest.approx(np.log(2), abs=1e-6)
+    image = sitk.ReadImage(str(tmp_path / "lines.mha"))
+    assert image.GetSpacing()[:2] == pytest.approx((0.4, 0.5)) and image.GetOrigin()[:2] == pytest.approx((-1.2, -1.25))
+    write_mesh(tmp_path / "box.stl", trimesh.creation.box((30.0, 4.0, 90.0)))
+    assert main(["convert", str(tmp_path / "box.stl"), str(tmp_path / "box.ply")]) == 0
+    assert "12 triangles, 30 x 4 x 90 mm" in capsys.readouterr().out
+    assert read_mesh(tmp_path / "box.ply").volume == pytest.approx(30 * 4 * 90)

@@ -2,7 +2,7 @@
 
 from torchkcreg.experiments.capture import CaptureStudy, CaptureTrial, capture_study
 from torchkcreg.experiments.compare_files import Comparison, compare_files
-from torchkcreg.experiments.convert_files import convert_geometry
+from torchkcreg.experiments.convert_files import convert
 from torchkcreg.experiments.demo import demo
 from torchkcreg.experiments.densitometry_files import densitometry_files
 from torchkcreg.experiments.describe import describe, describe_installation, picture_geometry
@@ -36,7 +36,7 @@ __all__ = [
     "ViewPlan",
     "capture_study",
     "compare_files",
-    "convert_geometry",
+    "convert",
     "demo",
     "densitometry_files",
     "describe",

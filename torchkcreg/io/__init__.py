@@ -12,13 +12,20 @@ from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write
 from .init import read_init, write_init
 from .layers import read_layers, write_layers
 from .matrix_tables import read_matrix_table, write_matrix_table
-from .meshes import read_mesh, write_mesh, write_point_cloud_ply
+from .meshes import WRITTEN_SUFFIXES, read_mesh, write_mesh, write_point_cloud_ply
 from .point_cloud_ply import read_point_cloud_ply
 from .points import read_points, write_points
 from .references import read_reference
 from .rtk_geometry import read_rtk, write_rtk
 from .runs import LAYERS, REPORT, RunFolder, read_run
-from .scans import ProjectionFile, Projections, implausible_magnification, read_projections, write_projections
+from .scans import (
+    ProjectionFile,
+    Projections,
+    implausible_magnification,
+    read_projections,
+    write_projections,
+    write_stack,
+)
 from .spectra import read_spectrum, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
 from .versions import versions
@@ -28,6 +35,7 @@ from .vtk_xml import write_points_vtp, write_surface_vtu
 __all__ = [
     "LAYERS",
     "REPORT",
+    "WRITTEN_SUFFIXES",
     "ProjectionFile",
     "Projections",
     "RunFolder",
@@ -70,6 +78,7 @@ __all__ = [
     "write_projections",
     "write_rtk",
     "write_spectrum",
+    "write_stack",
     "write_surface_vtu",
     "write_text",
     "write_volume",

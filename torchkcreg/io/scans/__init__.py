@@ -5,7 +5,7 @@ from .images import image_header, read_image
 from .measured import Projections
 from .plausible import implausible_magnification
 from .projection_file import ProjectionFile
-from .projections import read_projections, write_projections
+from .projections import read_projections, write_projections, write_stack
 
 __all__ = [
     "DICOM_SUFFIXES",
@@ -17,4 +17,5 @@ __all__ = [
     "read_image",
     "read_projections",
     "write_projections",
+    "write_stack",
 ]

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import SimpleITK as sitk
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
@@ -69,6 +70,25 @@ def read_projections(
     for doubt in doubts:
         warnings.warn(f"projections file {path}: {doubt}", stacklevel=2)
     return replace(projections, header=header)
+
+
+def write_stack(
+    path: str | os.PathLike[str], line_integrals: Tensor, pixel_spacing: Sequence[float] | None = None
+) -> None:
+    """Nothing; writes line integrals (V, rows, cols) as an image stack (MHA, NRRD, NIfTI), single precision.
+
+    Args:
+        path: the file.
+        line_integrals: NaN where a pixel does not count.
+        pixel_spacing: (dv, du) in mm, for the header; the origin is that of a centred detector, as RTK has it.
+    """
+    image = sitk.GetImageFromArray(line_integrals.detach().cpu().float().numpy())
+    if pixel_spacing is not None:
+        (dv, du), (rows, cols) = pixel_spacing, line_integrals.shape[-2:]
+        image.SetSpacing((float(du), float(dv), 1.0))
+        image.SetOrigin((-du * (cols - 1) / 2, -dv * (rows - 1) / 2, 0.0))
+    with atomic_path(path) as temporary:
+        sitk.WriteImage(image, str(temporary), True)
 
 
 def _check_room(path: Path) -> None:
