@@ -273,3 +273,7 @@ def test_meshes_and_projections_are_converted_by_the_targets_ending(tmp_path, ca
     assert main(["convert", str(tmp_path / "box.stl"), str(tmp_path / "box.ply")]) == 0
     assert "12 triangles, 30 x 4 x 90 mm" in capsys.readouterr().out
     assert read_mesh(tmp_path / "box.ply").volume == pytest.approx(30 * 4 * 90)
+    assert main(["convert", str(tmp_path / "lines.mha"), str(tmp_path / "lines.nii.gz")]) == 0
+    for target in ("lines.npz", "lines.tif"):
+        assert main(["convert", str(tmp_path / "lines.mha"), str(tmp_path / target)]) == 2
+        assert "line integrals as .mha, .nrrd" in capsys.readouterr().err

@@ -134,6 +134,29 @@ def test_a_description_that_is_wrong_is_refused(tmp_path, text, reason):
         read_projections(tmp_path / "s.yaml")
 
 
+def test_a_folder_of_raw_files_has_one_a_view(tmp_path):
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "flat").mkdir()
+    for index, view in enumerate(RAW):
+        view.astype("<f4").tofile(tmp_path / "scan" / f"{index}.raw")
+    for index in range(2):
+        FLAT.astype("<f4").tofile(tmp_path / "flat" / f"{index}.raw")
+    DARK.astype("<f4").tofile(tmp_path / "dark.raw")
+    text = "images: scan\nflat: flat\ndark: dark.raw\nraw: {shape: [12, 6, 7], type: float32}\n"
+    (tmp_path / "scan.yaml").write_text(text)
+    np.testing.assert_allclose(lines_of(tmp_path / "scan.yaml"), LINES, atol=1e-4)
+    (tmp_path / "scan" / "11.raw").unlink()
+    with pytest.raises(ValueError, match=r"scan holds 11 images, raw.shape says 12"):
+        read_projections(tmp_path / "scan.yaml")
+
+
+def test_an_open_beam_for_each_view_goes_with_its_view(tmp_path):
+    beams = np.linspace(3000, 4000, 12)
+    np.save(tmp_path / "p.npy", beams[:, None, None] * np.exp(-LINES))
+    part = ProjectionFile(tmp_path / "p.npy", open_beam=beams).read([7, 2, 3, 4, 5, 6, 8])  # as many as columns
+    np.testing.assert_allclose(part.line_integrals, LINES[[7, 2, 3, 4, 5, 6, 8]], atol=1e-5)
+
+
 def test_hdf5_of_data_exchange_nxtomo_or_one_dataset(tmp_path):
     with h5py.File(tmp_path / "exchange.h5", "w") as file:
         file["exchange/data"], file["exchange/data_white"] = RAW, np.stack([0.9 * FLAT, 1.1 * FLAT])
@@ -145,6 +168,14 @@ def test_hdf5_of_data_exchange_nxtomo_or_one_dataset(tmp_path):
         group["image_key"] = [1, 2, *[0] * 12, 1]
     np.testing.assert_allclose(lines_of(tmp_path / "nx.nxs"), LINES, atol=1e-4)
     np.testing.assert_allclose(ProjectionFile(tmp_path / "nx.nxs").read([11]).line_integrals, LINES[[11]], atol=1e-4)
+    with h5py.File(tmp_path / "one.h5", "w") as file:
+        file["exchange/data"], file["exchange/data_white"], file["exchange/data_dark"] = RAW, FLAT, DARK
+    np.testing.assert_allclose(lines_of(tmp_path / "one.h5"), LINES, atol=1e-4)
+    with h5py.File(tmp_path / "nx.nxs", "a") as file:
+        detector = file["entry1/tomo_entry/instrument/detector"]
+        shown = file.create_group("entry1/tomo_entry/data")
+        shown["data"], shown["image_key"] = detector["data"], detector["image_key"]  # hard links
+    np.testing.assert_allclose(lines_of(tmp_path / "nx.nxs"), LINES, atol=1e-4)
     with h5py.File(tmp_path / "two.h5", "w") as file:
         file["a/views"], file["b/views"] = LINES, 2 * LINES
     with pytest.raises(ValueError, match=r"2 datasets of three dimensions \(a/views, b/views\): name one"):
@@ -201,6 +232,31 @@ def test_a_folder_of_dicom_files_is_in_the_order_of_their_numbers(tmp_path):
     assert read_geometry(tmp_path).angles_deg == pytest.approx((0, 10, 20))
 
 
+def test_dicom_files_without_endings_or_numbers_are_in_the_order_of_their_names(tmp_path):
+    counts = np.round(RAW[:3]).astype(np.uint16)
+    for number, index in ((1, 0), (2, 1), (10, 2)):
+        dicom(tmp_path / f"IM{number}", counts[index], **{**XA, "PositionerPrimaryAngle": number})
+    np.testing.assert_allclose(lines_of(tmp_path, open_beam=4000), -np.log(counts / 4000), atol=1e-6)
+    assert read_geometry(tmp_path).angles_deg == pytest.approx((1, 2, 10))
+    assert read_geometry(tmp_path / "IM10").angles_deg == pytest.approx((10,))
+    dicom(tmp_path / "IM10", counts[2], **{**XA, "PositionerPrimaryAngle": 10, "InstanceNumber": 7})
+    for read in (read_geometry, read_projections):
+        with pytest.raises(ValueError, match="do not say their order"):
+            read(tmp_path)
+
+
+def test_each_dicom_file_has_distances_of_its_own_and_pixels_of_one_size(tmp_path):
+    for index, sdd in enumerate((1200, 1300)):
+        dicom(tmp_path / f"{index}.dcm", RAW[index], **{**XA, "DistanceSourceToDetector": sdd})
+    assert read_geometry(tmp_path).detector_distances.tolist() == pytest.approx([1200, 1300])
+    dicom(tmp_path / "1.dcm", RAW[1], **{**XA, "ImagerPixelSpacing": [0.2, 0.2]})
+    with pytest.raises(ValueError, match="pixels of different numbers or sizes"):
+        read_geometry(tmp_path)
+    dicom(tmp_path / "1.dcm", RAW[1], **XA, PixelIntensityRelationshipSign=-1)
+    with pytest.raises(ValueError, match="fewer X-rays"):
+        read_projections(tmp_path / "1.dcm", open_beam=4000)
+
+
 def test_dicom_that_does_not_say_enough_is_refused(tmp_path):
     def refused(reason: str, **tags: object) -> None:
         dicom(tmp_path / "x.dcm", RAW[:3], **{**XA, **tags})
@@ -239,3 +295,48 @@ def test_pages_of_a_tiff_are_views(tmp_path):
     np.testing.assert_allclose(part.line_integrals, -np.log(counts[[11, 0]] / 4000), atol=1e-6)
     image(tmp_path / "f.tif", LINES.astype(np.float32))
     np.testing.assert_allclose(lines_of(tmp_path / "f.tif"), LINES, rtol=1e-6)
+
+
+def test_headers_of_other_programs_are_read(tmp_path):
+    """Keys of DICOM's, comments, flags as numbers; and what ITK's reader does not survive is refused."""
+    stack = RAW.astype("<f4")
+    head = (
+        "ObjectType = Image\nNDims = 3\nComment = plate, loaded = 300 N\nBinaryData = True\n0018|0060 = 90\n"
+        "BinaryDataByteOrderMSB = False\nCompressedData = False\nTransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 0 0 0\n"
+        "ElementSpacing = 0.4 0.4 1\nDimSize = 7 6 12\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n"
+    )
+    (tmp_path / "a.mha").write_bytes(head.encode() + stack.tobytes())
+    np.testing.assert_allclose(lines_of(tmp_path / "a.mha", open_beam=4000), -np.log(stack / 4000), atol=1e-5)
+    for wrong, reason in (("BinaryData = True", "BinaryData = rue"), ("NDims = 3", "NDims = -1")):
+        (tmp_path / "b.mha").write_bytes(head.replace(wrong, reason).encode() + stack.tobytes())
+        with pytest.raises(ValueError, match="its header's"):
+            read_projections(tmp_path / "b.mha", open_beam=4000)
+
+
+def test_vectors_and_detached_headers(tmp_path):
+    """A displacement field is no projections; data that lie beside their header are not asked for their size."""
+    field = sitk.GetImageFromArray(np.zeros((4, 5, 6, 3), np.float32), isVector=True)
+    sitk.WriteImage(field, str(tmp_path / "field.nii"))
+    with pytest.raises(ValueError, match="3 numbers a pixel"):
+        read_projections(tmp_path / "field.nii")
+    stack = np.tile(LINES, (1, 40, 30)).astype(np.float32)
+    sitk.WriteImage(sitk.GetImageFromArray(stack), str(tmp_path / "s.nhdr"))
+    np.testing.assert_array_equal(lines_of(tmp_path / "s.nhdr"), stack)
+
+
+def test_numbers_of_a_tiff_are_what_was_stored(tmp_path):
+    counts = np.array([[1, 2**31 + 5], [7, 2**32 - 1]], np.uint32)
+    image(tmp_path / "u.tif", counts)
+    np.testing.assert_allclose(
+        lines_of(tmp_path / "u.tif", open_beam=2.0**32), -np.log(counts / 2.0**32)[None], rtol=1e-5, atol=1e-6
+    )
+    Image.fromarray(np.full((4, 5), 9, np.uint8)).save(tmp_path / "w.tif", tiffinfo={262: 0})
+    with pytest.raises(ValueError, match="white is zero"):
+        read_projections(tmp_path / "w.tif", open_beam=255)
+
+
+def test_a_folder_may_mix_endings_of_one_kind(tmp_path):
+    for index, suffix in enumerate((".tif", ".TIFF", ".TIF")):
+        image(tmp_path / f"{index}.tif", LINES[index].astype(np.float32))
+        (tmp_path / f"{index}.tif").rename(tmp_path / f"{index}{suffix}")
+    np.testing.assert_allclose(lines_of(tmp_path), LINES[:3], rtol=1e-6)

@@ -18,7 +18,8 @@ from torchkcreg.io import (
     write_stack,
 )
 
-IMAGE_SUFFIXES = (".mha", ".nrrd", ".nii")
+IMAGE_SUFFIXES = (".mha", ".nrrd", ".nii", ".nii.gz")
+GEOMETRY_SUFFIXES = (".json", ".xml", ".npy", ".npz", ".csv", ".txt")
 
 
 def convert(
@@ -62,12 +63,16 @@ def convert(
         mesh = read_mesh(source)
         write_mesh(target, mesh)
         return f"{len(mesh.faces)} triangles, {' x '.join(f'{size:.4g}' for size in mesh.extents)} mm: {target}"
-    if target.suffix.lower() in IMAGE_SUFFIXES:
+    if target.name.lower().endswith(IMAGE_SUFFIXES):
         found = read_projections(source, open_beam=open_beam)
         lines = torch.where(found.mask, found.line_integrals, torch.nan)
         write_stack(target, lines, spacing or (found.header.spacing if found.header else None))
         left = f"; {note}" if (note := found.masked_note()) else ""
         return f"line integrals of {len(lines)} views of {lines.shape[1]} x {lines.shape[2]} pixels: {target}{left}"
+    if target.suffix.lower() not in GEOMETRY_SUFFIXES or source.name.lower().endswith(IMAGE_SUFFIXES):
+        kinds = (("geometries", GEOMETRY_SUFFIXES), ("meshes", WRITTEN_SUFFIXES), ("line integrals", IMAGE_SUFFIXES))
+        known = "; ".join(f"{what} as {', '.join(suffixes)}" for what, suffixes in kinds)
+        raise ValueError(f"{source.name} is not written as {target.name}: {known}")
     geometry = read_geometry(source, projections=projections, det_shape=det_shape, pixel_spacing=spacing, layout=layout)
     turned = ""
     if gantry_axis != "z":

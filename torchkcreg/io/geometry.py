@@ -14,7 +14,7 @@ from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.io.files import existing_place, read_json, write_json
 from torchkcreg.io.matrix_tables import SUFFIXES, read_matrix_table, write_matrix_table
 from torchkcreg.io.rtk_geometry import read_rtk, write_rtk
-from torchkcreg.io.scans import DICOM_SUFFIXES, image_header, read_dicom_geometry
+from torchkcreg.io.scans import image_header, is_dicom, read_dicom_geometry
 from torchkcreg.plain import finite_array, finite_number
 
 CONVENTION = "u = (P[0].X)/(P[2].X), v = (P[1].X)/(P[2].X); X=(x,y,z,1) in mm; u column, v row, 0-based pixel centres"
@@ -56,7 +56,7 @@ def read_geometry(
     """
     file = existing_place(path, "geometry")
     suffix = file.suffix.lower()
-    if suffix in DICOM_SUFFIXES or file.is_dir():
+    if is_dicom(file) or file.is_dir():
         try:
             return read_dicom_geometry(file)
         except ValueError as error:

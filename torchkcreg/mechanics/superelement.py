@@ -222,7 +222,7 @@ def _senses(displacements: Tensor) -> Tensor:
     """
     rising = torch.linspace(1.0, 1.01, displacements.shape[1], dtype=displacements.dtype, device=displacements.device)
     largest = (displacements.abs() * rising).argmax(1, keepdim=True)
-    return displacements.gather(1, largest).sign()
+    return 1.0 - 2.0 * (displacements.gather(1, largest) < 0)
 
 
 def _balanced(holds: Sequence[Hold], scale: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Projections as they are measured: files and folders of images of many kinds, to line integrals with a mask."""
 
-from .dicom import DICOM_SUFFIXES, read_dicom_geometry
+from .dicom import is_dicom, read_dicom_geometry
 from .images import image_header, read_image
 from .measured import Projections
 from .plausible import implausible_magnification
@@ -8,11 +8,11 @@ from .projection_file import ProjectionFile
 from .projections import read_projections, write_projections, write_stack
 
 __all__ = [
-    "DICOM_SUFFIXES",
     "ProjectionFile",
     "Projections",
     "image_header",
     "implausible_magnification",
+    "is_dicom",
     "read_dicom_geometry",
     "read_image",
     "read_projections",

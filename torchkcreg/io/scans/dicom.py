@@ -12,14 +12,35 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, DetectorFrames
+from torchkcreg.io.scans.order import by_number
 
 DICOM_SUFFIXES = (".dcm", ".ima")
 NEEDED = "DICOM files need pydicom: pip install 'torchkcreg[io]'"
 
 
-def instance_number(path: Path) -> float:
-    """A file's place in its series; 0 where it says none."""
-    return _number(_tags(path), "InstanceNumber", 0)
+def is_dicom(path: Path) -> bool:
+    """Whether a file is DICOM: by its ending, or, where it has none, by its first bytes."""
+    if path.suffix.lower() in DICOM_SUFFIXES:
+        return True
+    if path.suffix.strip(".0123456789") or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(132)[128:] == b"DICM"
+
+
+def dicom_files(folder: Path) -> list[Path]:
+    """DICOM files of a folder, in the order of their instance numbers, or of the numbers in their names.
+
+    Raises:
+        ValueError: some have a number of their own, and others the same or none.
+    """
+    files = sorted((file for file in folder.iterdir() if is_dicom(file)), key=by_number)
+    numbers = [_number(_tags(file), "InstanceNumber", 0) for file in files]
+    if len(set(numbers)) == 1:
+        return files
+    if len(set(numbers)) < len(files):
+        raise ValueError("its DICOM files do not say their order: InstanceNumber is missing or the same in some")
+    return [file for _, file in sorted(zip(numbers, files, strict=True))]
 
 
 def dicom_images(path: Path) -> NDArray:
@@ -36,6 +57,8 @@ def dicom_images(path: Path) -> NDArray:
             f"its pixels are {relation} of the X-ray intensity (PixelIntensityRelationship), not in proportion to it: "
             "ask the scanner for unprocessed images"
         )
+    if _number(data, "PixelIntensityRelationshipSign", 1) < 0:
+        raise ValueError("its pixels are larger where fewer X-rays are (PixelIntensityRelationshipSign): invert them")
     try:
         images = np.asarray(data.pixel_array)
     except Exception as error:  # pydicom's and its decoders' own
@@ -59,31 +82,43 @@ def read_dicom_geometry(path: Path) -> ConeBeamGeometry:
     Raises:
         ValueError: tags are missing or contradict each other, or images are flipped or turned.
     """
-    files = sorted(path.iterdir(), key=lambda file: file.name) if path.is_dir() else [path]
-    files = [file for file in files if file.suffix.lower() in DICOM_SUFFIXES]
+    files = dicom_files(path) if path.is_dir() else [path]
     if not files:
-        raise ValueError("holds no DICOM files (.dcm)")
-    tags = sorted((_tags(file) for file in files), key=lambda one: int(_number(one, "InstanceNumber", 0)))
-    first = tags[0]
-    if _text(first, "FieldOfViewHorizontalFlip") == "YES" or _number(first, "FieldOfViewRotation", 0) != 0:
-        raise ValueError("images are flipped or turned against the detector (FieldOfView tags): undo that first")
+        raise ValueError("holds no DICOM files")
+    tags = [_tags(file) for file in files]
+    shapes = {(int(_number(one, "Rows")), int(_number(one, "Columns")), *_spacing(one)) for one in tags}
+    if len(shapes) > 1:
+        raise ValueError(f"its files have pixels of different numbers or sizes: {sorted(shapes)}")
+    rows, cols, *spacing = shapes.pop()
     primary, secondary = (
         torch.cat([_angles(one, name) for one in tags]).deg2rad()
         for name in ("PositionerPrimaryAngle", "PositionerSecondaryAngle")
     )
-    sad, sdd = _number(first, "DistanceSourceToPatient"), _number(first, "DistanceSourceToDetector")
-    if not 0 < sad < sdd:
-        raise ValueError(f"DistanceSourceToPatient {sad:g} mm must lie between 0 and DistanceSourceToDetector {sdd:g}")
-    spacing = _numbers(first, "ImagerPixelSpacing")
-    if len(spacing) != 2 or min(spacing) <= 0:
-        raise ValueError(f"ImagerPixelSpacing must be two positive numbers, got {spacing}")
+    sad, sdd = torch.cat([_distances(one) for one in tags]).T[..., None]
     sin_a, cos_a, sin_b, cos_b = primary.sin(), primary.cos(), secondary.sin(), secondary.cos()
     towards = torch.stack([sin_a * cos_b, -cos_a * cos_b, sin_b], dim=1)  # from the isocentre to the detector
     across = torch.stack([cos_a, sin_a, torch.zeros_like(sin_a)], dim=1)
     down = torch.stack([sin_a * sin_b, -cos_a * sin_b, -cos_b], dim=1)
     frames = DetectorFrames(-sad * towards, (sdd - sad) * towards, spacing[1] * across, spacing[0] * down)
-    size = int(_number(first, "Rows")), int(_number(first, "Columns"))
-    return frames.geometry(size, angles_deg=primary.rad2deg().tolist())
+    return frames.geometry((int(rows), int(cols)), angles_deg=primary.rad2deg().tolist())
+
+
+def _spacing(tags: Any) -> tuple[float, float]:
+    """Pixel spacing (dv, du) in mm of images as the detector took them."""
+    if _text(tags, "FieldOfViewHorizontalFlip") == "YES" or _number(tags, "FieldOfViewRotation", 0) != 0:
+        raise ValueError("images are flipped or turned against the detector (FieldOfView tags): undo that first")
+    spacing = _numbers(tags, "ImagerPixelSpacing")
+    if len(spacing) != 2 or min(spacing) <= 0:
+        raise ValueError(f"ImagerPixelSpacing must be two positive numbers, got {spacing}")
+    return spacing[0], spacing[1]
+
+
+def _distances(tags: Any) -> Tensor:
+    """From the source to the isocentre and to the detector (frames, 2), mm."""
+    sad, sdd = _number(tags, "DistanceSourceToPatient"), _number(tags, "DistanceSourceToDetector")
+    if not 0 < sad < sdd:
+        raise ValueError(f"DistanceSourceToPatient {sad:g} mm must lie between 0 and DistanceSourceToDetector {sdd:g}")
+    return torch.tensor([[sad, sdd]], dtype=torch.float64).expand(int(_number(tags, "NumberOfFrames", 1)), 2)
 
 
 def _angles(tags: Any, name: str) -> Tensor:

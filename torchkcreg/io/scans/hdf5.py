@@ -55,7 +55,7 @@ def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
             for key, kind in (("data_white", "open_beam"), ("data_dark", "dark")):
                 if key in parent:
                     _check(parent[key], key, path)
-                    fields[kind] = _mean(parent[key], range(parent[key].shape[0]))
+                    fields[kind] = _field(parent[key], key, tuple(data.shape[1:]))
         elif "image_key" in parent and tuple(parent["image_key"].shape) == (data.shape[0],):
             keys = parent["image_key"][()]
             views = np.flatnonzero(keys == _PROJECTION).tolist()
@@ -65,7 +65,10 @@ def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
 
     def read(indices: Sequence[int]) -> NDArray:
         with _opened(pyfive, path) as again:
-            return np.stack([again[name][views[index]] for index in indices])
+            images = np.stack([np.asarray(again[name][views[index]]) for index in indices])
+        if images.ndim != 3 or images.dtype.kind not in "uif":
+            raise ValueError(f"dataset {name} gives no images: is it a virtual one? Write it as a plain one")
+        return images
 
     return Hdf5Images(len(views), read, fields)
 
@@ -83,7 +86,8 @@ def _chosen(stacks: dict[str, Any], dataset: str | None) -> str:
             raise ValueError(f"has no dataset {dataset} of three dimensions; it has {', '.join(stacks) or 'none'}")
         return dataset.strip("/")
     known = [name for name, data in stacks.items() if name.endswith("exchange/data") or "image_key" in data.parent]
-    for names in (known, list(stacks)):
+    measured = [name for name in known if "detector/" in name]  # others are links to it
+    for names in (known, measured, list(stacks)):
         if len(names) == 1:
             return names[0]
     if not stacks:
@@ -100,6 +104,15 @@ def _check(data: Any, name: str, path: Path) -> None:
     size = path.stat().st_size
     if data.size * data.dtype.itemsize > max(_SMALLEST, _MOST_PACKED * size) or data.size == 0:
         raise ValueError(f"dataset {name} claims {data.shape} numbers, more than a file of {size} bytes can hold")
+
+
+def _field(data: Any, name: str, shape: tuple[int, ...]) -> NDArray:
+    """A flat or dark field (rows, cols): the mean of several, or the one that there is."""
+    if tuple(data.shape) == shape:
+        return np.asarray(data[()]).astype(np.float32)
+    if tuple(data.shape[1:]) != shape:
+        raise ValueError(f"dataset {name} must hold images {shape}, got shape {tuple(data.shape)}")
+    return _mean(data, range(data.shape[0]))
 
 
 def _mean(data: Any, indices: Sequence[int] | NDArray) -> NDArray:

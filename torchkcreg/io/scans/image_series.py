@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchkcreg.io.scans.dicom import DICOM_SUFFIXES, dicom_images, instance_number
+from torchkcreg.io.scans.dicom import DICOM_SUFFIXES, dicom_files, dicom_images, is_dicom
 from torchkcreg.io.scans.hdf5 import HDF5_SUFFIXES, open_hdf5
-from torchkcreg.io.scans.images import num_slices, read_image, read_slices
+from torchkcreg.io.scans.images import opened, read_slices
+from torchkcreg.io.scans.order import by_number
 from torchkcreg.io.scans.pages import PAGE_SUFFIXES, num_pages, read_pages
 from torchkcreg.io.scans.plausible import ImageHeader
 from torchkcreg.io.scans.scan_description import DESCRIPTION_SUFFIXES, Described, read_description
 
-STACK_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nii", ".nii.gz")
+STACK_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".nii.gz")
 VIEW_SUFFIXES = (*STACK_SUFFIXES, *PAGE_SUFFIXES, *DICOM_SUFFIXES)  # of which a folder may hold one file a view
 SERIES_SUFFIXES = (".npy", *VIEW_SUFFIXES, *HDF5_SUFFIXES, *DESCRIPTION_SUFFIXES)
 
@@ -56,14 +57,14 @@ def open_series(path: Path) -> ImageSeries:
     """
     if path.is_dir():
         return _of_folder(path)
-    name, suffix = path.name.lower(), path.suffix.lower()
+    suffix = path.suffix.lower()
     if suffix in DESCRIPTION_SUFFIXES:
         return _described(path)
     if suffix in HDF5_SUFFIXES:
         return _of_hdf5(path, None)
     if suffix == ".npy":
         return _of_array(np.load(path, mmap_mode="r", allow_pickle=False))
-    if name.endswith((*STACK_SUFFIXES, *PAGE_SUFFIXES, *DICOM_SUFFIXES)):
+    if _kind(path) is not None:
         return _of_images(path)
     known = ", ".join((".npz", *SERIES_SUFFIXES))
     raise ValueError(f"projections are {known}, or a folder of images, not {suffix or 'without a suffix'}")
@@ -74,10 +75,11 @@ def _of_images(path: Path) -> ImageSeries:
     suffix = path.suffix.lower()
     if suffix in PAGE_SUFFIXES:
         return ImageSeries(num_pages(path), lambda views: read_pages(path, views))
-    if suffix in DICOM_SUFFIXES:
+    if is_dicom(path):
         return _of_array(dicom_images(path))
-    header = ImageHeader.of(read_image(path, first=True))
-    return ImageSeries(num_slices(path), lambda views: read_slices(path, views), header=header)
+    reader = opened(path)
+    number = (*reader.GetSize(), 1)[2]
+    return ImageSeries(number, lambda views: read_slices(path, views), header=ImageHeader.of(reader))
 
 
 def _of_array(array: NDArray) -> ImageSeries:
@@ -93,14 +95,14 @@ def _of_hdf5(path: Path, dataset: str | None) -> ImageSeries:
 
 def _of_folder(folder: Path) -> ImageSeries:
     files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
-    kinds = sorted({kind for file in files for kind in VIEW_SUFFIXES if file.name.lower().endswith(kind)})
-    if len(kinds) != 1:
-        what = f"files of several kinds ({', '.join(kinds)})" if kinds else "no images"
+    kinds = {file: kind for file in files if (kind := _kind(file)) is not None}
+    if len(found := sorted(set(kinds.values()))) != 1:
+        what = f"files of several kinds ({', '.join(found)})" if found else "no images"
         raise ValueError(f"a folder of projections holds one image file a view, this one {what}")
-    views = sorted((file for file in files if file.name.lower().endswith(kinds[0])), key=_by_number)
-    if kinds[0] in DICOM_SUFFIXES:
-        views.sort(key=instance_number)
+    if found == ["DICOM"]:
+        views = dicom_files(folder)
     else:
+        views = sorted(kinds, key=by_number)
         _check_numbers(views)
     first, header = _single(views[0])
 
@@ -108,6 +110,15 @@ def _of_folder(folder: Path) -> ImageSeries:
         return np.stack([_alike(views[index], first) for index in indices])
 
     return ImageSeries(len(views), read, header=header)
+
+
+def _kind(file: Path) -> str | None:
+    """Of an image file; None for one that is something else."""
+    if is_dicom(file):
+        return "DICOM"
+    name = file.name.lower()
+    same = {".tiff": ".tif", ".nii.gz": ".nii"}
+    return next((same.get(kind, kind) for kind in (*STACK_SUFFIXES, *PAGE_SUFFIXES) if name.endswith(kind)), None)
 
 
 def _single(file: Path) -> tuple[NDArray, ImageHeader | None]:
@@ -127,11 +138,6 @@ def _alike(file: Path, first: NDArray) -> NDArray:
         kinds = [f"{x.shape[0]} x {x.shape[1]} {x.dtype}" for x in (image, first)]
         raise ValueError(f"{file.name} is {kinds[0]}, the first image is {kinds[1]}")
     return image
-
-
-def _by_number(file: Path) -> list[tuple[int, str]]:
-    """Names in the order that people expect: view_2 before view_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", file.name.lower())]
 
 
 def _check_numbers(files: list[Path]) -> None:
@@ -171,10 +177,29 @@ def _described(path: Path) -> ImageSeries:
 
 
 def _opened(scan: Described, place: Path) -> ImageSeries:
-    if scan.raw is not None and not place.is_dir() and not place.name.lower().endswith(SERIES_SUFFIXES):
-        return _of_array(scan.raw.mapped(place, views=place == scan.images))
+    if scan.raw is not None:
+        if place.is_dir() and (files := [file for file in place.iterdir() if _is_raw(file)]):
+            return _of_raw(scan, place, sorted(files, key=by_number))
+        if place.is_file() and _is_raw(place):
+            return _of_raw(scan, place, [place])
     if place.suffix.lower() in HDF5_SUFFIXES:
         return _of_hdf5(place, scan.dataset)
     if place.suffix.lower() in DESCRIPTION_SUFFIXES:
         raise ValueError(f"{place.name} is another description: name images")
     return open_series(place)
+
+
+def _is_raw(file: Path) -> bool:
+    """Whether a file has no header that is known."""
+    name = file.name.lower()
+    return file.is_file() and not name.startswith(".") and not name.endswith(SERIES_SUFFIXES) and not is_dicom(file)
+
+
+def _of_raw(scan: Described, place: Path, files: list[Path]) -> ImageSeries:
+    """Files without a header, one after the other."""
+    assert scan.raw is not None
+    parts = [scan.raw.mapped(file, views=len(files) == 1 and place == scan.images) for file in files]
+    owners = [(part, index) for part in parts for index in range(len(part))]
+    if place == scan.images and len(owners) != scan.raw.shape[0]:
+        raise ValueError(f"{place.name} holds {len(owners)} images, raw.shape says {scan.raw.shape[0]}")
+    return ImageSeries(len(owners), lambda views: np.stack([owners[view][0][owners[view][1]] for view in views]))

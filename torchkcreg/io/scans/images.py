@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +26,12 @@ def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
         RuntimeError: It cannot be read, or its header asks for more than the file can hold.
         ValueError: It holds more than one number a pixel.
     """
-    reader = _opened(path)
+    reader = opened(path)
     if reader.GetNumberOfComponents() != 1:
         raise ValueError(f"it has {reader.GetNumberOfComponents()} numbers a pixel: grey images have one")
     cols, rows, number = (*reader.GetSize(), 1)[:3]
+    if math.prod(reader.GetSize()[3:]) != 1:
+        raise ValueError(f"it has {len(reader.GetSize())} dimensions of {reader.GetSize()}: a stack of views has three")
     if list(slices) == list(range(number)):
         return sitk.GetArrayFromImage(reader.Execute()).reshape(number, rows, cols)
     found = []
@@ -37,11 +40,6 @@ def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
         reader.SetExtractSize([cols, rows, 1])
         found.append(sitk.GetArrayFromImage(reader.Execute())[0])
     return np.stack(found)
-
-
-def num_slices(path: Path) -> int:
-    """How many slices a volume has, by its header; raises as `read_slices`."""
-    return (*_opened(path).GetSize(), 1)[2]
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ def image_header(path: Path) -> PixelHeader | None:
     if path.suffix.lower() not in (".mha", ".mhd", ".nrrd", ".nhdr", ".nii"):
         return None
     try:
-        reader = _opened(path)
+        reader = opened(path)
     except RuntimeError as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise ValueError(f"projections file {path} cannot be read: {reason}") from error
@@ -76,16 +74,13 @@ def image_header(path: Path) -> PixelHeader | None:
     return PixelHeader((rows, cols), None if du == dv == 1.0 else (dv, du), (u0, v0))
 
 
-def read_image(path: Path, *, first: bool = False) -> sitk.Image:
-    """The image of a file, or its first slice alone; raises as `read_slices`."""
-    reader = _opened(path)
-    if first and len(reader.GetSize()) == 3:
-        reader.SetExtractSize([*reader.GetSize()[:2], 1])
-    return reader.Execute()
+def read_image(path: Path) -> sitk.Image:
+    """The image of a file; raises as `read_slices`."""
+    return opened(path).Execute()
 
 
-def _opened(path: Path) -> sitk.ImageFileReader:
-    """A reader that has read the header, and believes it."""
+def opened(path: Path) -> sitk.ImageFileReader:
+    """A reader that has read the header, and believes it; raises as `read_slices`."""
     if path.suffix.lower() in META_SUFFIXES:
         check_meta_header(path)
     reader = sitk.ImageFileReader()
@@ -93,6 +88,14 @@ def _opened(path: Path) -> sitk.ImageFileReader:
     reader.ReadImageInformation()
     needed = math.prod(reader.GetSize()) * reader.GetNumberOfComponents()  # of a byte or more each
     file = path.stat().st_size
-    if path.suffix.lower() not in _DETACHED and needed > max(_SMALLEST, _MOST_PACKED * file):
+    if not _is_detached(path) and needed > max(_SMALLEST, _MOST_PACKED * file):
         raise RuntimeError(f"its header asks for {needed} values, more than a file of {file} bytes can hold")
     return reader
+
+
+def _is_detached(path: Path) -> bool:
+    """Whether a header's data are in another file, so that its own size says nothing."""
+    if path.suffix.lower() in _DETACHED:
+        return True
+    with path.open("rb") as file:
+        return path.suffix.lower() == ".nrrd" and re.search(rb"^data ?file:", file.read(4096), re.M | re.I) is not None

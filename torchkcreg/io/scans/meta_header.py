@@ -17,18 +17,18 @@ def check_meta_header(path: Path) -> None:
     """
     with path.open("rb") as file:
         start = file.read(_LONGEST)
-    end = re.search(rb"^ElementDataFile *=.*$", start, re.MULTILINE)
+    end = re.search(rb"^ElementDataFile[ \t]*[=:].*$", start, re.MULTILINE)
     if end is None:
         raise RuntimeError("its header has no ElementDataFile")
     lines = start[: end.end()].decode("latin-1").splitlines()
-    pairs = [line.split("=", 1) for line in lines if line.strip()]
-    if any(len(pair) != 2 or not re.fullmatch(r"\w+", pair[0].strip()) for pair in pairs):
-        raise RuntimeError("its header has a line that is no key and value")
-    header = {key.strip(): value.strip() for key, value in pairs}
-    if len(header) < len(pairs):
-        raise RuntimeError("its header has a key twice")
+    parts = [re.sub("[=:]", "=", line, count=1).partition("=") for line in lines]
+    pairs = [(key.strip(), value.strip()) for key, _, value in parts]
+    header = dict(pairs)
+    for key in (*_FLAGS, "NDims", "DimSize", "ElementNumberOfChannels"):
+        if [name for name, _ in pairs].count(key) > 1:
+            raise RuntimeError(f"its header has {key} twice")
     for flag in _FLAGS:
-        if header.get(flag, "True").lower() not in ("true", "false"):
+        if header.get(flag, "True").lower() not in ("true", "false", "t", "f", "1", "0"):
             raise RuntimeError(f"its header's {flag} must be True or False, got {header[flag]!r}")
     sizes = header.get("DimSize", "").split()
     if not re.fullmatch(r"[1-4]", header.get("NDims", "")) or len(sizes) != int(header["NDims"]):

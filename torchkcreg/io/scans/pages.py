@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 PAGE_SUFFIXES = (".tif", ".tiff", ".png")
+_SAMPLE_FORMAT, _BITS, _PHOTOMETRIC = 339, 258, 262  # tags
+_UNSIGNED = 1
 _GREY = ("L", "I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 
 
@@ -33,10 +35,24 @@ def read_pages(path: Path, pages: Sequence[int]) -> NDArray:
             file.seek(page)
             if file.mode not in _GREY:
                 raise ValueError(f"page {page} is of kind {file.mode}, not grey numbers of up to 32 bits")
-            found.append(np.array(file))
+            found.append(_numbers(file, page))
     if len({(image.shape, image.dtype) for image in found}) > 1:
         raise ValueError("its pages are of different sizes or kinds")
     return np.stack(found)
+
+
+def _numbers(file: Image.Image, page: int) -> NDArray:
+    """A page as it is stored: Pillow takes unsigned numbers of 32 bits for signed ones, and turns others over."""
+    tags = getattr(file, "tag_v2", {})
+    sample, bits = (tags.get(tag, (default,)) for tag, default in ((_SAMPLE_FORMAT, _UNSIGNED), (_BITS, 8)))
+    kind = sample[0] if isinstance(sample, tuple) else sample
+    depth = bits[0] if isinstance(bits, tuple) else bits
+    if tags and tags.get(_PHOTOMETRIC) == 0:
+        raise ValueError(f"page {page} says that white is zero: write it with black as zero")
+    if tags and kind != _UNSIGNED and depth == 8:
+        raise ValueError(f"page {page} has signed numbers of 8 bits: write it with 16")
+    image = np.array(file)
+    return image.view(np.uint32) if tags and depth == 32 and kind == _UNSIGNED and image.dtype == np.int32 else image
 
 
 @contextmanager

@@ -69,8 +69,8 @@ class ImageHeader:
     turned: bool
 
     @classmethod
-    def of(cls, image: sitk.Image) -> ImageHeader | None:
-        """The header of a stack of views; None where it is the default, which says nothing."""
+    def of(cls, image: sitk.Image | sitk.ImageFileReader) -> ImageHeader | None:
+        """The header of a stack of views, or of a reader that has read it; None for the default, which says nothing."""
         du, dv = image.GetSpacing()[:2]
         size = image.GetDimension()
         turned = not np.allclose(np.reshape(image.GetDirection(), (size, size)), np.eye(size), atol=1e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from torchkcreg.io.files import existing_place
@@ -47,9 +48,14 @@ class ProjectionFile:
         """
         try:
             check_views(views, len(self))
-            return converted(self._series.arrays(views), self.open_beam, None, None)
+            return converted(self._series.arrays(views), self._beam(views), None, None)
         except (ValueError, RuntimeError) as error:
             raise self._error(error) from error
+
+    def _beam(self, views: Sequence[int]) -> ArrayLike | None:
+        """The open beam of some views, where it is told for each."""
+        beam = None if self.open_beam is None else np.asarray(self.open_beam)
+        return beam[list(views)] if beam is not None and beam.ndim in (1, 3) and len(beam) == len(self) else beam
 
     def _error(self, error: Exception) -> ValueError:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
