@@ -145,7 +145,8 @@ def test_plan_ranks_views_without_any_image(small_case, tmp_path, capsys):
 def test_compare_of_a_run_with_itself_finds_no_motion_and_writes_table_and_figure(finished, tmp_path, capsys):
     flags = ["--loads", "100", "200", f"--out={tmp_path / 'c'}"]
     assert main(["compare", str(finished), str(finished), str(finished), *flags]) == 0
-    assert {entry.name for entry in (tmp_path / "c").iterdir()} == {"compare.json", "compare.csv", "compare.png"}
+    written = {"compare.json", "compare.csv", "compare.png", "report.html"}
+    assert {entry.name for entry in (tmp_path / "c").iterdir()} == written
     content = json.loads((tmp_path / "c" / "compare.json").read_text())
     first = content["runs"][0]
     assert max(map(abs, first["rotation_deg"] + first["translation_mm"])) < 1e-6
