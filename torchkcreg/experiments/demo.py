@@ -11,6 +11,7 @@ from torch import Tensor
 from torchkcreg.evaluation import PointMetrics, evaluate_points, point_errors
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import (
+    REPORT,
     write_components,
     write_geometry,
     write_json,
@@ -68,6 +69,7 @@ def demo(out: Path, *, seed: int = 0, overwrite: bool = False) -> dict[str, Poin
     print(f"{time.perf_counter() - start:.0f} s. Pictures:")
     for picture in ("overlay", "displacement", "history"):
         print(f"  {out / RUN / picture}.png")
+    print(f"All of it on one page: {out / RUN / REPORT}")
     return metrics
 
 
