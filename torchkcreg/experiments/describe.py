@@ -12,6 +12,7 @@ import torch
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.implant import volume
 from torchkcreg.io import (
+    MESH_SUFFIXES,
     geometry_from_dict,
     read_components,
     read_config,
@@ -32,7 +33,6 @@ from torchkcreg.visualization import geometry_figure
 
 from .describe_run import describe_run
 
-_MESHES = (".stl", ".obj", ".ply", ".off", ".3mf", ".step", ".stp")
 _VOLUMES = (".mha", ".mhd", ".nrrd", ".nii", ".gz")
 _STACKS = (".tif", ".tiff", ".png", ".h5", ".hdf5", ".hdf", ".nxs")
 
@@ -66,7 +66,7 @@ def describe(path: Path, *, open_beam: float | None = None) -> str:
     """
     path, projections = Path(path), partial(_projections, open_beam=open_beam)
     readers: dict[tuple[str, ...], list[Callable[[Path], str]]] = {
-        _MESHES: [_mesh],
+        MESH_SUFFIXES: [_mesh],
         (".json",): [_json],
         (".xml",): [_rtk],
         (".csv", ".txt"): [_spectrum, _points, _matrices],

@@ -41,6 +41,14 @@ def matrices_from_frames(
     return torch.cat([inverse, -inverse @ sources.double().unsqueeze(-1)], dim=-1)
 
 
+def gantry_axes(radians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit vectors (V, 3) towards a source that turns about z from x, along its way, and up."""
+    zero = torch.zeros_like(radians)
+    radial = torch.stack([radians.cos(), radians.sin(), zero], dim=-1)
+    along = torch.stack([-radians.sin(), radians.cos(), zero], dim=-1)
+    return radial, along, radial.new_tensor([0.0, 0.0, 1.0]).expand_as(radial)
+
+
 def circular_geometry(
     angles_deg: Sequence[float],
     *,
@@ -81,10 +89,7 @@ def circular_geometry(
     heights = torch.as_tensor(source_z_mm, dtype=torch.float64)
     if heights.ndim > 1 or heights.numel() not in (1, len(degrees)):
         raise ValueError(f"source_z_mm must be one number or one for each of {len(degrees)} views, got {source_z_mm}")
-    zero = torch.zeros_like(angles)
-    radial = torch.stack([angles.cos(), angles.sin(), zero], dim=-1)
-    col_axes = torch.stack([-angles.sin(), angles.cos(), zero], dim=-1)
-    row_axes = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(radial)
+    radial, col_axes, row_axes = gantry_axes(angles)
     matrices = matrices_from_frames(
         sad * radial + heights.expand_as(angles)[:, None] * row_axes,
         -(sdd - sad) * radial + det_offset_mm[0] * row_axes + det_offset_mm[1] * col_axes,

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchkcreg.geometry.circular import gantry_axes
 from torchkcreg.geometry.cone_beam import ConeBeamGeometry
 from torchkcreg.geometry.frames import DetectorFrames
 
@@ -113,7 +114,7 @@ def from_leap_cone(
     [0, -400, 0]
     """
     degrees = torch.as_tensor(phis).double().reshape(-1)
-    along, across, up = _gantry(torch.deg2rad(degrees) - math.pi / 2)
+    along, across, up = gantry_axes(torch.deg2rad(degrees) - math.pi / 2)
     tilt = math.radians(tilt_angle)
     columns = math.cos(tilt) * across + math.sin(tilt) * up
     rows = math.cos(tilt) * up - math.sin(tilt) * across
@@ -159,7 +160,7 @@ def from_tigre(geo: Any, angles: Sequence[float] | Tensor) -> ConeBeamGeometry:
 
     if bool(each("rotDetector", 3).any()):
         raise ValueError("a detector that is turned in itself (rotDetector) is given by its vectors: DetectorFrames")
-    along, across, up = _gantry(radians)
+    along, across, up = gantry_axes(radians)
     dso, dsd, axis = each("DSO", 1), each("DSD", 1), each("COR", 1)
     shift_v, shift_u = each("offDetector", 2).split(1, dim=1)
     beside = axis * across - each("offOrigin", 3).flip(1)
@@ -169,10 +170,3 @@ def from_tigre(geo: Any, angles: Sequence[float] | Tensor) -> ConeBeamGeometry:
     )
     rows, cols = (int(n) for n in geo.nDetector)
     return frames.geometry((rows, cols), angles_deg=torch.rad2deg(radians).tolist())
-
-
-def _gantry(radians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit vectors (V, 3) towards a source that turns about z from x, along its way, and up."""
-    cos, sin, zero = torch.cos(radians), torch.sin(radians), torch.zeros_like(radians)
-    along, across = torch.stack([cos, sin, zero], dim=1), torch.stack([-sin, cos, zero], dim=1)
-    return along, across, torch.stack([zero, zero, torch.ones_like(zero)], dim=1)

@@ -12,7 +12,7 @@ from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write
 from .init import read_init, write_init
 from .layers import read_layers, write_layers
 from .matrix_tables import read_matrix_table, write_matrix_table
-from .meshes import WRITTEN_SUFFIXES, read_mesh, write_mesh, write_point_cloud_ply
+from .meshes import MESH_SUFFIXES, WRITTEN_SUFFIXES, read_mesh, write_mesh, write_point_cloud_ply
 from .point_cloud_ply import read_point_cloud_ply
 from .points import read_points, write_points
 from .references import read_reference
@@ -34,6 +34,7 @@ from .vtk_xml import write_points_vtp, write_surface_vtu
 
 __all__ = [
     "LAYERS",
+    "MESH_SUFFIXES",
     "REPORT",
     "WRITTEN_SUFFIXES",
     "ProjectionFile",

@@ -34,13 +34,18 @@ def dicom_files(folder: Path) -> list[Path]:
     Raises:
         ValueError: some have a number of their own, and others the same or none.
     """
-    files = sorted((file for file in folder.iterdir() if is_dicom(file)), key=by_number)
-    numbers = [_number(_tags(file), "InstanceNumber", 0) for file in files]
-    if len(set(numbers)) == 1:
-        return files
-    if len(set(numbers)) < len(files):
+    return list(_ordered(folder))
+
+
+def _ordered(folder: Path) -> dict[Path, Any]:
+    """Files in their order, and what each says."""
+    tags = {file: _tags(file) for file in sorted(filter(is_dicom, folder.iterdir()), key=by_number)}
+    numbers = {file: _number(one, "InstanceNumber", 0) for file, one in tags.items()}
+    if 1 < len(set(numbers.values())) < len(numbers):
         raise ValueError("its DICOM files do not say their order: InstanceNumber is missing or the same in some")
-    return [file for _, file in sorted(zip(numbers, files, strict=True))]
+    return {
+        file: tags[file] for file in sorted(tags, key=lambda file: numbers[file])
+    }  # as they are where all are alike
 
 
 def dicom_images(path: Path) -> NDArray:
@@ -82,10 +87,9 @@ def read_dicom_geometry(path: Path) -> ConeBeamGeometry:
     Raises:
         ValueError: tags are missing or contradict each other, or images are flipped or turned.
     """
-    files = dicom_files(path) if path.is_dir() else [path]
-    if not files:
+    tags = list(_ordered(path).values()) if path.is_dir() else [_tags(path)]
+    if not tags:
         raise ValueError("holds no DICOM files")
-    tags = [_tags(file) for file in files]
     shapes = {(int(_number(one, "Rows")), int(_number(one, "Columns")), *_spacing(one)) for one in tags}
     if len(shapes) > 1:
         raise ValueError(f"its files have pixels of different numbers or sizes: {sorted(shapes)}")

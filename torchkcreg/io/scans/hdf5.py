@@ -5,30 +5,21 @@ They are read by pyfive: HDF5's own library does not survive some damaged files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchkcreg.io.scans.images import can_hold
+from torchkcreg.io.scans.series import ImageSeries
+
 HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs")
-_MOST_PACKED = 5000  # as of images: how many times larger than its file a dataset can be
-_SMALLEST = 1 << 16
 _PROJECTION, _FLAT, _DARK = 0, 1, 2  # of NXtomo's image_key
 
 
-@dataclass(frozen=True)
-class Hdf5Images:
-    """As `ImageSeries`."""
-
-    num_views: int
-    read: Callable[[Sequence[int]], NDArray]
-    beside: dict[str, NDArray] = field(default_factory=dict)
-
-
-def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
+def open_hdf5(path: Path, dataset: str | None = None) -> ImageSeries:
     """The projections of an HDF5 file, with the means of its flat and dark fields.
 
     Without a name, they are those of Data Exchange (`exchange/data`, `data_white`, `data_dark`), of NXtomo (`image_key`
@@ -61,7 +52,7 @@ def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
             views = np.flatnonzero(keys == _PROJECTION).tolist()
             for number, kind in ((_FLAT, "open_beam"), (_DARK, "dark")):
                 if (keys == number).any():
-                    fields[kind] = _mean(data, np.flatnonzero(keys == number))
+                    fields[kind] = _plain(data).mean(np.flatnonzero(keys == number).tolist())
 
     def read(indices: Sequence[int]) -> NDArray:
         with _opened(pyfive, path) as again:
@@ -70,7 +61,7 @@ def open_hdf5(path: Path, dataset: str | None = None) -> Hdf5Images:
             raise ValueError(f"dataset {name} gives no images: is it a virtual one? Write it as a plain one")
         return images
 
-    return Hdf5Images(len(views), read, fields)
+    return ImageSeries(len(views), read, fields)
 
 
 def _opened(pyfive: Any, path: Path) -> Any:
@@ -102,7 +93,7 @@ def _check(data: Any, name: str, path: Path) -> None:
     if data.dtype.kind not in "uif":
         raise ValueError(f"dataset {name} holds no numbers, but {data.dtype}")
     size = path.stat().st_size
-    if data.size * data.dtype.itemsize > max(_SMALLEST, _MOST_PACKED * size) or data.size == 0:
+    if data.size == 0 or not can_hold(size, data.size * data.dtype.itemsize):
         raise ValueError(f"dataset {name} claims {data.shape} numbers, more than a file of {size} bytes can hold")
 
 
@@ -112,11 +103,9 @@ def _field(data: Any, name: str, shape: tuple[int, ...]) -> NDArray:
         return np.asarray(data[()]).astype(np.float32)
     if tuple(data.shape[1:]) != shape:
         raise ValueError(f"dataset {name} must hold images {shape}, got shape {tuple(data.shape)}")
-    return _mean(data, range(data.shape[0]))
+    return _plain(data).mean(range(data.shape[0]))
 
 
-def _mean(data: Any, indices: Sequence[int] | NDArray) -> NDArray:
-    total = np.zeros(data.shape[1:], np.float64)
-    for index in indices:
-        total += data[int(index)]
-    return (total / max(len(indices), 1)).astype(np.float32)
+def _plain(data: Any) -> ImageSeries:
+    """All images of a dataset."""
+    return ImageSeries(data.shape[0], lambda indices: np.stack([np.asarray(data[int(index)]) for index in indices]))

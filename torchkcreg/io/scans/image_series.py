@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,35 +16,12 @@ from torchkcreg.io.scans.images import opened, read_slices
 from torchkcreg.io.scans.order import by_number
 from torchkcreg.io.scans.pages import PAGE_SUFFIXES, num_pages, read_pages
 from torchkcreg.io.scans.plausible import ImageHeader
-from torchkcreg.io.scans.scan_description import DESCRIPTION_SUFFIXES, Described, read_description
+from torchkcreg.io.scans.scan_description import DESCRIPTION_SUFFIXES, RawHeader, ScanDescription, read_description
+from torchkcreg.io.scans.series import ImageSeries
 
 STACK_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".nii.gz")
 VIEW_SUFFIXES = (*STACK_SUFFIXES, *PAGE_SUFFIXES, *DICOM_SUFFIXES)  # of which a folder may hold one file a view
 SERIES_SUFFIXES = (".npy", *VIEW_SUFFIXES, *HDF5_SUFFIXES, *DESCRIPTION_SUFFIXES)
-
-
-@dataclass(frozen=True)
-class ImageSeries:
-    """Images of views that stay where they are until they are read.
-
-    Attributes:
-        num_views: how many there are.
-        read: images (v, rows, cols) of a list of views, as they are stored.
-        beside: what is said of them: "open_beam", "dark", each a number or an image (rows, cols), "saturation".
-        header: what the file says of pixels and axes; None where it says nothing.
-        lines: whether they are line integrals, where that is said; None where it is not.
-    """
-
-    num_views: int
-    read: Callable[[Sequence[int]], NDArray]
-    beside: dict[str, NDArray] = field(default_factory=dict)
-    header: ImageHeader | None = None
-    lines: bool | None = None
-
-    def arrays(self, views: Sequence[int]) -> dict[str, NDArray]:
-        """Images of the given views and what is said of them, by name; images of no stated kind are the "image"."""
-        kind = {None: "image", True: "line_integrals", False: "intensity"}[self.lines]
-        return {kind: self.read(views), **self.beside}
 
 
 def open_series(path: Path) -> ImageSeries:
@@ -61,7 +37,7 @@ def open_series(path: Path) -> ImageSeries:
     if suffix in DESCRIPTION_SUFFIXES:
         return _described(path)
     if suffix in HDF5_SUFFIXES:
-        return _of_hdf5(path, None)
+        return open_hdf5(path)
     if suffix == ".npy":
         return _of_array(np.load(path, mmap_mode="r", allow_pickle=False))
     if _kind(path) is not None:
@@ -86,11 +62,6 @@ def _of_array(array: NDArray) -> ImageSeries:
     if array.ndim != 3:
         raise ValueError(f"images must be numbers of shape (V, rows, cols), got {array.dtype} {array.shape}")
     return ImageSeries(len(array), lambda views: np.asarray(array[list(views)]))
-
-
-def _of_hdf5(path: Path, dataset: str | None) -> ImageSeries:
-    images = open_hdf5(path, dataset)
-    return ImageSeries(images.num_views, images.read, images.beside)
 
 
 def _of_folder(folder: Path) -> ImageSeries:
@@ -165,25 +136,26 @@ def _described(path: Path) -> ImageSeries:
     for name, place in (("open_beam", scan.flat), ("dark", scan.dark)):
         if place is not None:
             fields = _opened(scan, place)
-            images = [fields.read([view])[0] for view in range(fields.num_views)]
-            if images[0].shape != size:
-                raise ValueError(f"{place.name} has images of {images[0].shape} pixels, the views have {size}")
-            beside[name] = np.stack(images).mean(0, dtype=np.float64).astype(np.float32)
+            mean = fields.mean(range(fields.num_views))
+            if mean.shape != size:
+                raise ValueError(f"{place.name} has images of {mean.shape} pixels, the views have {size}")
+            beside[name] = mean
     if scan.open_beam is not None:
         beside["open_beam"] = np.asarray(scan.open_beam)
     if scan.saturation is not None:
         beside["saturation"] = np.asarray(scan.saturation)
-    return ImageSeries(series.num_views, series.read, beside, series.header, scan.lines)
+    return ImageSeries(series.num_views, series.read, beside, series.header, scan.line_integrals)
 
 
-def _opened(scan: Described, place: Path) -> ImageSeries:
+def _opened(scan: ScanDescription, place: Path) -> ImageSeries:
     if scan.raw is not None:
-        if place.is_dir() and (files := [file for file in place.iterdir() if _is_raw(file)]):
-            return _of_raw(scan, place, sorted(files, key=by_number))
-        if place.is_file() and _is_raw(place):
-            return _of_raw(scan, place, [place])
+        files = sorted(
+            (file for file in (place.iterdir() if place.is_dir() else [place]) if _is_raw(file)), key=by_number
+        )
+        if files:
+            return _of_raw(scan.raw, place, files, views=place == scan.images)
     if place.suffix.lower() in HDF5_SUFFIXES:
-        return _of_hdf5(place, scan.dataset)
+        return open_hdf5(place, scan.dataset)
     if place.suffix.lower() in DESCRIPTION_SUFFIXES:
         raise ValueError(f"{place.name} is another description: name images")
     return open_series(place)
@@ -195,11 +167,10 @@ def _is_raw(file: Path) -> bool:
     return file.is_file() and not name.startswith(".") and not name.endswith(SERIES_SUFFIXES) and not is_dicom(file)
 
 
-def _of_raw(scan: Described, place: Path, files: list[Path]) -> ImageSeries:
-    """Files without a header, one after the other."""
-    assert scan.raw is not None
-    parts = [scan.raw.mapped(file, views=len(files) == 1 and place == scan.images) for file in files]
-    owners = [(part, index) for part in parts for index in range(len(part))]
-    if place == scan.images and len(owners) != scan.raw.shape[0]:
-        raise ValueError(f"{place.name} holds {len(owners)} images, raw.shape says {scan.raw.shape[0]}")
-    return ImageSeries(len(owners), lambda views: np.stack([owners[view][0][owners[view][1]] for view in views]))
+def _of_raw(raw: RawHeader, place: Path, files: list[Path], *, views: bool) -> ImageSeries:
+    """Files without a header, one after the other; views are as many as the header says."""
+    parts = [raw.mapped(file, views=views and len(files) == 1) for file in files]
+    images = [image for part in parts for image in part]
+    if views and len(images) != raw.shape[0]:
+        raise ValueError(f"{place.name} holds {len(images)} images, raw.shape says {raw.shape[0]}")
+    return ImageSeries(len(images), lambda indices: np.stack([images[index] for index in indices]))

@@ -88,9 +88,14 @@ def opened(path: Path) -> sitk.ImageFileReader:
     reader.ReadImageInformation()
     needed = math.prod(reader.GetSize()) * reader.GetNumberOfComponents()  # of a byte or more each
     file = path.stat().st_size
-    if not _is_detached(path) and needed > max(_SMALLEST, _MOST_PACKED * file):
+    if not _is_detached(path) and not can_hold(file, needed):
         raise RuntimeError(f"its header asks for {needed} values, more than a file of {file} bytes can hold")
     return reader
+
+
+def can_hold(file: int, needed: int) -> bool:
+    """Whether a file of so many bytes can unpack to as many as are needed."""
+    return needed <= max(_SMALLEST, _MOST_PACKED * file)
 
 
 def _is_detached(path: Path) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -65,9 +64,9 @@ class ScanDescription(Config):
         raw: how numbers lie in files without a header.
     """
 
-    images: str
-    flat: str | None = None
-    dark: str | None = None
+    images: Path
+    flat: Path | None = None
+    dark: Path | None = None
     open_beam: float | None = Field(None, gt=0)
     saturation: float | None = Field(None, gt=0)
     line_integrals: bool | None = None
@@ -75,22 +74,8 @@ class ScanDescription(Config):
     raw: RawHeader | None = None
 
 
-@dataclass(frozen=True)
-class Described:
-    """A description whose places exist; attributes as of `ScanDescription`."""
-
-    images: Path
-    flat: Path | None
-    dark: Path | None
-    open_beam: float | None
-    saturation: float | None
-    lines: bool | None
-    dataset: str | None
-    raw: RawHeader | None
-
-
-def read_description(path: Path) -> Described:
-    """A scan's description.
+def read_description(path: Path) -> ScanDescription:
+    """A scan's description, whose places exist.
 
     Raises:
         FileNotFoundError: a place that it names is missing.
@@ -103,20 +88,11 @@ def read_description(path: Path) -> Described:
         raise ValueError("line integrals need no flat, dark or open_beam")
     if said.dark is not None and said.flat is None and said.open_beam is None:
         raise ValueError("a dark field alone leaves the open beam unknown: name flat or open_beam")
-    place = lambda name: None if name is None else _place(path, name)  # noqa: E731
-    return Described(
-        _place(path, said.images),
-        place(said.flat),
-        place(said.dark),
-        said.open_beam,
-        said.saturation,
-        said.line_integrals,
-        said.dataset,
-        said.raw,
-    )
+    places = {name: place for name in ("images", "flat", "dark") if (place := getattr(said, name)) is not None}
+    return said.model_copy(update={name: _place(path, place) for name, place in places.items()})
 
 
-def _place(path: Path, name: str) -> Path:
+def _place(path: Path, name: Path) -> Path:
     """A place that a description at a path names."""
     folder, place = path.parent, path.parent / name
     if not place.resolve().is_relative_to(folder.resolve()):
