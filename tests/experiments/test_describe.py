@@ -75,6 +75,11 @@ def test_every_file_that_is_read_is_described(small_case, tmp_path):
     assert "3 views of 4 x 5 pixels" in describe(tmp_path / "scan.yaml")
     (tmp_path / "c.yaml").write_text("material: steel\n")
     assert describe(tmp_path / "c.yaml").endswith("configuration with material")
+    sitk.WriteImage(sitk.GetImageFromArray(np.full((3, 4, 5), 9, np.float32)), str(tmp_path / "s.nhdr"))
+    assert "3 views of 4 x 5 pixels" in describe(tmp_path / "s.nhdr")
+    sitk.WriteImage(sitk.GetImageFromArray(np.arange(20, dtype=np.uint16).reshape(1, 4, 5)), str(tmp_path / "a.dcm"))
+    (tmp_path / "a.dcm").rename(tmp_path / "IM0001")  # DICOM without an ending, and without a geometry
+    assert "1 views of 4 x 5 pixels" in describe(tmp_path / "IM0001", open_beam=100.0)
     (tmp_path / "volume").mkdir()
     write_volume(tmp_path / "volume" / "volume.mha", torch.rand(3, 4, 5), VolumeGrid((3, 4, 5), 1.5))
     assert "reconstruction; volume.mha is a volume, 5 x 4 x 3" in describe(tmp_path / "volume")

@@ -28,12 +28,13 @@ from torchkcreg.io import (
     versions,
     write_figure,
 )
+from torchkcreg.io.scans import is_dicom
 from torchkcreg.kernels import PACKAGE, choose_backend, unavailable_reason
 from torchkcreg.visualization import geometry_figure
 
 from .describe_run import describe_run
 
-_VOLUMES = (".mha", ".mhd", ".nrrd", ".nii", ".gz")
+_VOLUMES = (".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".gz")
 _STACKS = (".tif", ".tiff", ".png", ".h5", ".hdf5", ".hdf", ".nxs")
 
 
@@ -73,18 +74,21 @@ def describe(path: Path, *, open_beam: float | None = None) -> str:
         (".npz", ".npy"): [_matrices, projections],
         _VOLUMES: [projections, _volume],
         _STACKS: [projections],
-        (".dcm", ".ima"): [_dicom, projections],
         (".yaml", ".yml"): [partial(_yaml, open_beam=open_beam)],
     }
     if path.is_dir():
         return f"{path}: {_folder(path, open_beam)}"
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
+    if is_dicom(path):
+        return f"{path}: {_first(path, [_dicom, projections])}"
     for suffixes, candidates in readers.items():
         if path.suffix.lower() in suffixes:
             return f"{path}: {_first(path, candidates)}"
     known = ", ".join(suffix for suffixes in readers for suffix in suffixes)
-    raise ValueError(f"{path} is none of what can be described: a folder of results, or a file ending in {known}")
+    raise ValueError(
+        f"{path} is none of what can be described: a folder of results, DICOM, or a file ending in {known}"
+    )
 
 
 def picture_geometry(paths: Sequence[Path], out: Path) -> None:
