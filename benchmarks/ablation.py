@@ -19,10 +19,10 @@ import torch
 from tqdm import tqdm
 
 from torchkcreg.evaluation import bb_rmse
-from torchkcreg.experiments.capture import registration_inputs
 from torchkcreg.implant import find_holes
 from torchkcreg.registration import RegistrationConfig, Stage, preset_stages, register
 from torchkcreg.simulation import Load, SimulatedCase, weight_bearing_case
+from torchkcreg.studies.capture import registration_inputs
 
 CASES = {
     "axial load, 48 degrees": {"load": 1.0, "seed": 0, "views": (47, 48, 49)},

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import torch
 
-from torchkcreg.experiments import CaptureStudy, CaptureTrial, capture_study, resolve_config
+from torchkcreg.commands import resolve_config
 from torchkcreg.io import write_figure
 from torchkcreg.io.files import write_text
+from torchkcreg.studies import CaptureStudy, CaptureTrial, capture_study
 from torchkcreg.visualization import capture_figure
 
 REQUIRED_OFFSET, REQUIRED_SHARE = 10.0, 0.95

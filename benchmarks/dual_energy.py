@@ -17,8 +17,9 @@ from common import processor
 
 from torchkcreg.evaluation import cylinder_region, distance_to, region_statistics
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
+from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import tungsten_spectrum
-from torchkcreg.reconstruction import Decomposition, KnownComponent, decompose, unknown_share
+from torchkcreg.reconstruction import Decomposition, decompose, unknown_share
 from torchkcreg.simulation import DetectorModel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import reconstruction_figure

@@ -29,7 +29,7 @@ CASES = {
 
 def simulate(folder: Path) -> None:
     """The tibial plate under 600 N in the paper's views."""
-    from torchkcreg.experiments.paper.steps import ViewSets, packaged, simulated, start_of
+    from torchkcreg.studies.paper.experiment import ViewSets, packaged, simulated, start_of
 
     content = packaged("tibial_plate")
     content["configurations"] = {"cfg3": content["configurations"]["cfg3"]}
@@ -40,9 +40,9 @@ def simulate(folder: Path) -> None:
 def register(folder: Path, out: Path, views: str, known: bool, threads: int) -> None:
     """One registration in this process; prints what it took as JSON."""
     started = time.perf_counter()
-    from torchkcreg.experiments.inputs import RegistrationFiles
-    from torchkcreg.experiments.paper.steps import ViewSets
-    from torchkcreg.experiments.register_files import register_files
+    from torchkcreg.commands.register import register_files
+    from torchkcreg.commands.register_inputs import RegistrationFiles
+    from torchkcreg.studies.paper.experiment import ViewSets
 
     imported = time.perf_counter() - started
     torch.set_num_threads(threads)

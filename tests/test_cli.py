@@ -91,8 +91,8 @@ def test_warp_flags_points_beyond_the_implant(finished, tmp_path, capsys):
 
 
 def test_a_registration_starts_from_an_earlier_one_of_the_same_implant(small_case, finished, tmp_path, capsys):
-    from torchkcreg.experiments import RegistrationFiles
-    from torchkcreg.experiments.inputs import read_inputs
+    from torchkcreg.commands import RegistrationFiles
+    from torchkcreg.commands.register_inputs import read_inputs
     from torchkcreg.registration import RegistrationConfig
 
     names = {"geometry": small_case / "geometry.json", "projections": small_case / "projections.npz"}
@@ -110,8 +110,8 @@ def test_a_registration_starts_from_an_earlier_one_of_the_same_implant(small_cas
 
 
 def test_finite_elements_bend_an_implant_from_the_shape_of_an_earlier_run(small_case, finished, tmp_path, capsys):
-    from torchkcreg.experiments import RegistrationFiles
-    from torchkcreg.experiments.inputs import read_inputs
+    from torchkcreg.commands import RegistrationFiles
+    from torchkcreg.commands.register_inputs import read_inputs
     from torchkcreg.registration import RegistrationConfig, build_scene
 
     names = {"geometry": small_case / "geometry.json", "projections": small_case / "projections.npz"}

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-import torchkcreg.experiments  # noqa: F401  (its modules are patched)
+import torchkcreg.commands  # noqa: F401  (its modules are patched)
 from torchkcreg import cli
 from torchkcreg.console import Answer, Voice, run_command
 from torchkcreg.progress import progress_bar
@@ -51,11 +51,11 @@ def test_every_failure_is_one_line(capsys, kind, message):
 
 
 def test_a_failure_that_nothing_foresaw_names_its_step(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules["torchkcreg.experiments.describe"], "read_mesh", lambda path: [][0])
+    monkeypatch.setattr(sys.modules["torchkcreg.commands.info"], "read_mesh", lambda path: [][0])
     (tmp_path / "a.stl").write_bytes(b"")
     assert cli.main(["info", str(tmp_path / "a.stl")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "IndexError: list index out of range in experiments.describe (--debug" in line
+    assert "IndexError: list index out of range in commands.info (--debug" in line
     with pytest.raises(IndexError):
         cli.main(["info", str(tmp_path / "a.stl"), "--debug"])
 

@@ -1,41 +1,31 @@
+"""How the package is laid out: floors, levels, sizes, names, one way of importing, and who touches a disk."""
+
+from __future__ import annotations
+
 import ast
+import importlib
+import re
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parent.parent / "torchkcreg"
-FLOORS = {
-    "callbacks": 0,
-    "config": 0,
-    "console": 1,
-    "progress": 0,
-    "differentiable": 0,
-    "parameters": 0,
-    "plain": 0,
-    "precision": 0,
-    "kernels": 0,
-    "geometry": 1,
-    "physics": 1,
-    "similarity": 1,
-    "implant": 2,
-    "projector": 2,
-    "optimization": 1,
-    "splines": 2,
-    "mechanics": 3,
-    "deformation": 4,
-    "scene": 5,
-    "registration": 6,
-    "reconstruction": 6,
-    "simulation": 6,
-    "io": 7,
-    "evaluation": 7,
-    "visualization": 8,
-    "experiments": 9,
-    "studies": 10,
-    "cli": 11,
-}
-MOST_LEVELS = 6
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "torchkcreg"
+FILES = sorted(PACKAGE.rglob("*.py"))
 FOLDERS = sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file())
+MOST_LEVELS = 6
+MOST_LINES = 400
+SMALL = 80  # lines
+
+
+def table_of_floors() -> dict[str, int]:
+    """The floor of each folder and top-level file, from the table in CONTRIBUTING.md."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| (.+?) \|$", text, re.MULTILINE)
+    return {name: int(floor) for floor, names in rows for name in re.findall(r"`(\w+)(?:/|\.py)`", names)}
+
+
+FLOORS = table_of_floors()
 
 
 def imports_of(path: Path) -> set[str]:
@@ -58,8 +48,9 @@ def imports_of(path: Path) -> set[str]:
     return found
 
 
-def test_every_folder_has_a_floor():
-    assert set(FOLDERS) <= FLOORS.keys()
+def test_every_folder_and_file_has_a_floor():
+    files = {path.stem for path in PACKAGE.glob("*.py") if not path.stem.startswith("__")}
+    assert {*FOLDERS, *files} == FLOORS.keys()
 
 
 def test_the_floors_are_seen_to_be_used():
@@ -103,10 +94,142 @@ def test_the_files_of_a_folder_stand_on_few_levels_and_in_no_circle(folder):
     assert max(levels.values(), default=0) <= MOST_LEVELS, sorted(levels.items(), key=lambda item: item[1])
 
 
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_a_file_has_one_subject_and_stays_short(path):
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 260
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
     assert path.name != "utils.py"
+
+
+REASONS = {
+    "deformation/ffd.py": "the paper's model, which users look for under this name",
+    "deformation/reading.py": "reads every model, so it imports them all",
+    "evaluation/regions.py": "public functions of their own subject",
+    "implant/known_component.py": "what a reconstruction needs of an implant",
+    "io/volumes.py": "one format, one file",
+    "kernels/gpu/filters.py": "one kernel, one file",
+    "kernels/gpu/splines.py": "one kernel, one file",
+    "optimization/adam.py": "one optimiser, one file",
+    "optimization/cmaes.py": "one optimiser, one file",
+    "projector/voxel_ops.py": "operators stand beside their reference and their module",
+    "similarity/similarity.py": "the interface of a user's own similarity",
+    "physics/detector.py": "the detector of a simulation",
+    "visualization/case.py": "one figure, one file",
+    "visualization/comparison.py": "one figure, one file",
+    "visualization/load.py": "one figure, one file",
+    "visualization/plan.py": "one figure, one file",
+}
+
+
+def importers() -> dict[str, set[str]]:
+    """The files that import each module of the package, the folders' `__init__.py` aside."""
+    found: dict[str, set[str]] = {str(path.relative_to(PACKAGE)): set() for path in FILES}
+    for path in FILES:
+        package = ["torchkcreg", *path.relative_to(PACKAGE).parts[:-1]]
+        if path.name == "__init__.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                base = package[: len(package) - node.level + 1] if node.level else []
+                module = [*base, *(node.module or "").split(".")] if node.module else base
+                for full in (module, *([*module, alias.name] for alias in node.names)):
+                    name = "/".join(full[1:]) + ".py"
+                    if name in found:
+                        found[name].add(str(path.relative_to(PACKAGE)))
+    return found
+
+
+def test_a_small_module_with_one_importer_has_a_reason():
+    fragments = {
+        name
+        for name, by in importers().items()
+        if len(by) <= 1
+        and not name.startswith(("cli/", "commands/"))
+        and not name.endswith(("__init__.py", "__main__.py"))
+        and len((PACKAGE / name).read_text(encoding="utf-8").splitlines()) < SMALL
+    }
+    assert fragments <= REASONS.keys(), "fold them into their subject, or say why they stand alone"
+    assert {name for name in REASONS if not (PACKAGE / name).is_file()} == set()
+
+
+COMMANDS = {path.stem for path in (PACKAGE / "cli").glob("*.py")} - {"__init__", "command"}
+OF_STUDIES = {"experiment", "study"}  # their work is in studies/
+SAME_SUBJECT = {
+    "beam": {"physics", "kernels/gpu"},
+    "config": {"io", "registration"},
+    "densitometry": {"evaluation"},
+    "displacement_map": {"evaluation", "visualization"},
+    "experiment": {"studies/paper"},
+    "geometry": {"io", "visualization"},
+    "point_cloud": {"implant", "projector"},
+    "register": {"registration"},
+    "voxels": {"projector", "kernels/gpu"},
+}
+
+
+def test_a_file_name_stands_for_one_subject():
+    places: dict[str, set[str]] = {}
+    for path in FILES:
+        if path.stem not in ("__init__", "__main__"):
+            places.setdefault(path.stem, set()).add(str(path.parent.relative_to(PACKAGE)))
+    for name, folders in places.items():
+        of_command = {"cli", "commands", "visualization"} if name in COMMANDS else set()
+        assert len(folders) == 1 or folders <= of_command | SAME_SUBJECT.get(name, set()), f"{name}.py: {folders}"
+
+
+def test_a_public_name_means_one_thing():
+    meanings: dict[str, tuple[str, object]] = {}
+    for folder in FOLDERS:
+        module = importlib.import_module(f"torchkcreg.{folder}")
+        for name in getattr(module, "__all__", ()):
+            value = getattr(module, name)
+            other, same = meanings.setdefault(name, (folder, value))
+            assert same is value, f"{name} is one thing in {other} and another in {folder}"
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS - {"completion"} - OF_STUDIES))
+def test_a_command_has_its_flags_in_one_file_and_its_work_in_another(command):
+    flags = (PACKAGE / "cli" / f"{command}.py").read_text(encoding="utf-8")
+    assert f"def add_{command}(" in flags
+    assert (PACKAGE / "commands" / f"{command}.py").is_file()
+
+
+def test_reconstruction_knows_nothing_of_registration():
+    known = set().union(*(imports_of(path) for path in (PACKAGE / "reconstruction").rglob("*.py")))
+    assert not known & {"registration", "scene", "deformation", "commands"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_are_relative_inside_a_folder_and_absolute_across(path):
+    here = ".".join(["torchkcreg", *path.relative_to(PACKAGE).parts[:-1]])
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level <= 1, f"line {node.lineno}: from {'.' * node.level}{node.module or ''}"
+            inside = node.level == 0 and path.parent != PACKAGE and f"{node.module}.".startswith(f"{here}.")
+            assert not inside, f"line {node.lineno}: from {node.module}, which is the file's own folder"
+
+
+TOUCHES = {"open", "write_text", "write_bytes", "read_text", "read_bytes", "savefig", "save", "savez", "load"}
+ON_DISK = {
+    "physics/materials.py": "tables that come with the package",
+    "registration/result.py": "a result's own save and load",
+    "studies/paper/experiment.py": "recipes that come with the package",
+    "visualization/page.py": "style and scripts that come with the package",
+    "commands/report.py": "logs of any encoding",
+}
+
+
+def test_only_io_reads_and_writes_files():
+    touching = set()
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "open":
+                touching.add(path)
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in TOUCHES:
+                owner = node.func.value
+                if not (isinstance(owner, ast.Name) and owner.id in ("json", "yaml", "self", "cls")):
+                    touching.add(path)
+    names = {str(path.relative_to(PACKAGE)) for path in touching}
+    assert {name for name in names if not name.startswith(("io/", "kernels/"))} <= ON_DISK.keys()
 
 
 FACTORIES = {"arange", "empty", "eye", "full", "linspace", "ones", "rand", "randn", "tensor", "zeros"}

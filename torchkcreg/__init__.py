@@ -55,9 +55,9 @@ _HOMES = {
 }
 
 _FOLDERS = (
+    "commands",
     "deformation",
     "evaluation",
-    "experiments",
     "geometry",
     "implant",
     "io",
@@ -72,6 +72,7 @@ _FOLDERS = (
     "similarity",
     "simulation",
     "splines",
+    "studies",
     "visualization",
 )
 

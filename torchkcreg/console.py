@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchkcreg.plain import plain
-from torchkcreg.progress import silence
+from .plain import plain
+from .progress import silence
 
 WRONG, INTERRUPTED = 2, 130  # exit statuses
 _PACKAGE = Path(__file__).parent

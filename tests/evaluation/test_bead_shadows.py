@@ -5,8 +5,7 @@ import torch
 
 from torchkcreg.evaluation import bead_shadows, track_beads
 from torchkcreg.geometry import calibrate, circular_geometry
-from torchkcreg.simulation.chords import chord_image
-from torchkcreg.simulation.solids import Cylinder, Sphere
+from torchkcreg.simulation.solids import Cylinder, Sphere, chord_image
 
 GEOMETRY = circular_geometry(range(0, 360, 4), sad=404, sdd=538, det_shape=(70, 90), pixel_spacing=(0.8, 0.8))
 BEADS = torch.tensor([[14.0, 5.0, -9.0], [-16.0, 3.0, 11.0]], dtype=torch.float64)

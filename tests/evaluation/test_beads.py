@@ -54,7 +54,7 @@ def test_a_blurred_ball_has_the_volume_of_the_ball():
 
 
 def test_balls_of_a_scan_are_found_beside_a_bar():
-    from torchkcreg.simulation.chords import chord_image
+    from torchkcreg.simulation.solids import chord_image
 
     geometry = circular_geometry(range(0, 200, 2), sad=404, sdd=538, det_shape=(48, 80), pixel_spacing=(0.8, 0.8))
     centers = torch.tensor([[9.31, 2.17, 3.4], [-10.2, 6.6, -4.85]])

@@ -16,14 +16,14 @@ from torchkcreg.geometry import VolumeGrid, circular_geometry  # noqa: E402
 from torchkcreg.kernels.gpu import KERNELS  # noqa: E402
 from torchkcreg.physics import blur as blur_module  # noqa: E402
 from torchkcreg.physics import transmission as transmission_module  # noqa: E402,F401
-from torchkcreg.projector import cell_footprint, ops, voxel_ops, voxels  # noqa: E402
+from torchkcreg.projector import cell_footprint, point_ops, voxel_ops, voxels  # noqa: E402
 from torchkcreg.splines import ControlPointGrid  # noqa: E402
 from torchkcreg.splines import basis as basis_module  # noqa: E402
 from torchkcreg.splines.basis import SplineBasis  # noqa: E402
 
 OPERATORS = {
     operator.name: operator
-    for module in (blur_module, sys.modules["torchkcreg.physics.transmission"], ops, voxel_ops, basis_module)
+    for module in (blur_module, sys.modules["torchkcreg.physics.transmission"], point_ops, voxel_ops, basis_module)
     for operator in vars(module).values()
     if type(operator).__name__ == "Operator"
 }

@@ -10,15 +10,7 @@ import trimesh
 
 from torchkcreg.deformation import FiniteElementDeformation, Level, deformation_from_dict
 from torchkcreg.implant import ImplantPointCloud, find_holes
-from torchkcreg.mechanics import (
-    ElasticBody,
-    ExpectedLoads,
-    Hold,
-    LoadPrior,
-    Superelement,
-    holds_of,
-    shares_of_holds,
-)
+from torchkcreg.mechanics import ElasticBody, ExpectedLoads, Hold, LoadPrior, Superelement, holds_of, shares_of_holds
 from torchkcreg.mechanics.holds import unit_loads
 from torchkcreg.physics import elastic_constants
 from torchkcreg.plain import plain

@@ -6,7 +6,7 @@ from drr_bodies import camera, lattice, rotation
 
 from torchkcreg.kernels import choose_backend, unavailable_reason
 from torchkcreg.projector import cell_footprint, project_points
-from torchkcreg.projector.ops import point_drr
+from torchkcreg.projector.point_ops import point_drr
 
 SHAPE = (20, 26)
 CELL = 0.25 * torch.eye(3, dtype=torch.float64)

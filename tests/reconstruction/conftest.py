@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchkcreg.simulation.chords import chord_image
+from torchkcreg.simulation.solids import chord_image
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,9 @@ import torch
 import trimesh
 
 from torchkcreg.geometry import VolumeGrid, circular_geometry
+from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import Beam, material, tungsten_spectrum
-from torchkcreg.reconstruction import BeamModel, KnownComponent, component_path_lengths, estimate_beam
+from torchkcreg.reconstruction import BeamModel, component_path_lengths, estimate_beam
 from torchkcreg.simulation import DetectorModel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import beam_figure

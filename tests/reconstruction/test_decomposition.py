@@ -8,8 +8,9 @@ import trimesh
 
 from torchkcreg.evaluation import cylinder_region, region_statistics
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
+from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import tungsten_spectrum
-from torchkcreg.reconstruction import KnownComponent, PWLSConfig, decompose
+from torchkcreg.reconstruction import PWLSConfig, decompose
 from torchkcreg.simulation import DetectorModel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from torchkcreg.reconstruction.filtering import WINDOWS, filter_rows, ramp_response
+from torchkcreg.reconstruction.fdk import WINDOWS, filter_rows, ramp_response
 
 
 def test_the_response_is_the_ramp_away_from_zero_and_positive_at_zero():

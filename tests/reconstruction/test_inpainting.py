@@ -5,8 +5,9 @@ import torch
 import trimesh
 
 from torchkcreg.geometry import VolumeGrid, circular_geometry
+from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import tungsten_spectrum
-from torchkcreg.reconstruction import BeamModel, KnownComponent, component_path_lengths, fdk, inpainted, prepare
+from torchkcreg.reconstruction import BeamModel, component_path_lengths, fdk, inpainted, prepare
 from torchkcreg.simulation import DetectorModel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 

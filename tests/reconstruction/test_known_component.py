@@ -4,10 +4,10 @@ import trimesh
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import VolumeGrid, circular_geometry
+from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import material, tungsten_spectrum
 from torchkcreg.reconstruction import (
     BeamModel,
-    KnownComponent,
     PWLSConfig,
     component_path_lengths,
     known_materials,

@@ -7,7 +7,7 @@ import torch
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import MultisourceScanner, VolumeGrid, circular_geometry
 from torchkcreg.reconstruction import PWLS, PWLSConfig, VoxelSystem, pwls, statistical_weights
-from torchkcreg.reconstruction.roughness import VoxelRoughness
+from torchkcreg.reconstruction.system import VoxelRoughness
 
 GRID = VolumeGrid.centered((6, 12, 12), 5.0)
 

@@ -1,6 +1,6 @@
 import torch
 
-from torchkcreg.reconstruction.roughness import VoxelRoughness, quadratic_roughness
+from torchkcreg.reconstruction.system import VoxelRoughness, quadratic_roughness
 
 SPACING = (0.5, 0.7, 1.0)
 ROUGHNESS = VoxelRoughness(SPACING)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchkcreg.cli import main
-from torchkcreg.experiments import ReconstructionFiles, reconstruct_files, resolve_options
+from torchkcreg.commands import ReconstructionFiles, reconstruct_files, resolve_options
 from torchkcreg.geometry import circular_geometry
 from torchkcreg.io import read_volume, write_geometry, write_projections, write_spectrum
 from torchkcreg.physics import Beam, material, tungsten_spectrum

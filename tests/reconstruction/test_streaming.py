@@ -12,9 +12,10 @@ import trimesh
 
 from torchkcreg.cli import main
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
+from torchkcreg.implant import KnownComponent
 from torchkcreg.io import ProjectionFile, read_projections, read_volume, write_geometry, write_projections
 from torchkcreg.physics import Veil, material, tungsten_spectrum
-from torchkcreg.reconstruction import BeamModel, KnownComponent, PWLSConfig, component_path_lengths, fdk, reconstruct
+from torchkcreg.reconstruction import BeamModel, PWLSConfig, component_path_lengths, fdk, reconstruct
 from torchkcreg.simulation.solids import Sphere
 
 SCAN = {"sad": 404, "sdd": 538, "det_shape": (24, 36), "pixel_spacing": (2.5, 2.5)}

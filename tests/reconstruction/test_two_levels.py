@@ -6,9 +6,9 @@ import trimesh
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import TwoLevelGrid, VolumeGrid, circular_geometry
+from torchkcreg.implant import KnownComponent
 from torchkcreg.reconstruction import (
     BeamModel,
-    KnownComponent,
     PWLSConfig,
     TwoLevelRoughness,
     TwoLevelSystem,

@@ -6,7 +6,7 @@ from small_scene import GRID_OF_SCREWS, drilled_plate, image, objective
 
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import Objective, RegistrationConfig, Stage, Trainer, build_scene
-from torchkcreg.registration.basins import places
+from torchkcreg.registration.steps import places
 
 CONFIG = RegistrationConfig(stages=(Stage(oversampling=1, margin_mm=None),), **GRID_OF_SCREWS)
 

@@ -6,14 +6,7 @@ import pytest
 import torch
 from small_scene import bend, image, objective, pose, scene
 
-from torchkcreg.deformation import (
-    BendingPrior,
-    Elasticity,
-    FreeFormDeformation,
-    GroupMotion,
-    Level,
-    ModalMotion,
-)
+from torchkcreg.deformation import BendingPrior, Elasticity, FreeFormDeformation, GroupMotion, Level, ModalMotion
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import RegistrationConfig, Scene, Stage

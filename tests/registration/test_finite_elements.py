@@ -10,7 +10,7 @@ from small_scene import RIGID, image, plate
 from torchkcreg.io import RunFolder, read_run
 from torchkcreg.mechanics import CarriedLoad, Hold
 from torchkcreg.registration import Implant, RegistrationConfig, RegistrationResult, Stage, build_scene, register
-from torchkcreg.registration.models import deformation_of
+from torchkcreg.registration.implant import deformation_of
 
 HOLDS = [Hold(f"at {z:.0f}", (0.0, 0.0, z), 4.0) for z in (-22.0, -7.0, 7.0, 22.0)]
 BENDING = Stage(groups=20, modes=12, oversampling=1, tolerance=1e-4)

@@ -8,7 +8,7 @@ from small_scene import SCREW, image, pose, scene
 from test_register import PLAIN
 
 from torchkcreg.registration import Stage, StageRun
-from torchkcreg.registration.prepared import facing_data
+from torchkcreg.registration.estimated_background import facing_data
 from torchkcreg.scene import RegistrationData
 from torchkcreg.scene.following import FollowingBackground
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchkcreg.experiments.capture import registration_inputs
 from torchkcreg.registration import RegistrationConfig, Trainer, build_scene
 from torchkcreg.simulation import draw_case, random_case
+from torchkcreg.studies.capture import registration_inputs
 
 KINDS = {
     "a limb of water": {"water_radius": 45.0, "material": "steel", "screw_material": "steel", "azimuth_deg": 45.0},

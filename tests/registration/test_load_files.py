@@ -14,17 +14,11 @@ import trimesh
 from small_scene import plate
 
 from torchkcreg.cli import main
+from torchkcreg.commands import load_files
 from torchkcreg.deformation import FiniteElementDeformation, RigidDeformation
-from torchkcreg.experiments import load_files
 from torchkcreg.io import RunFolder, read_run, write_surface_vtu
 from torchkcreg.mechanics import Hold
-from torchkcreg.registration import (
-    Implant,
-    RegisteredImplant,
-    RegistrationConfig,
-    RegistrationResult,
-    build_scene,
-)
+from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConfig, RegistrationResult, build_scene
 
 HOLDS = [Hold(f"at {z:.0f}", (0.0, 0.0, z), 4.0) for z in (-22.0, -7.0, 7.0, 22.0)]
 CONFIG = RegistrationConfig(deformation="fe")

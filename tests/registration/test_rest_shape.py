@@ -23,15 +23,8 @@ from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.mechanics import Hold, Superelement
 from torchkcreg.physics import elastic_constants
 from torchkcreg.plain import plain
-from torchkcreg.registration import (
-    Implant,
-    RegisteredImplant,
-    RegistrationConfig,
-    Stage,
-    build_scene,
-    register,
-)
-from torchkcreg.registration.models import deformation_of
+from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConfig, Stage, build_scene, register
+from torchkcreg.registration.implant import deformation_of
 from torchkcreg.splines import default_grid
 
 HOLDS = [Hold(f"at {z:.0f}", (0.0, 0.0, z), 4.0) for z in (-22.0, -7.0, 7.0, 22.0)]

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchkcreg.registration.robust import residual_weights
+from torchkcreg.registration.objective import residual_weights
 from torchkcreg.similarity import GradientCorrelation, sobel_gradient
 
 

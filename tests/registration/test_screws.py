@@ -11,7 +11,7 @@ from small_scene import GRID_OF_SCREWS, drilled_plate, image, pose
 from torchkcreg.implant import Component, ImplantPointCloud, Screw, find_holes
 from torchkcreg.registration import Implant, RegistrationConfig, Stage, build_scene, find_screws, register
 from torchkcreg.scene import RegistrationData, Scene, ScrewPaths
-from torchkcreg.scene.screw_shapes import ScrewShapes
+from torchkcreg.scene.parameter_blocks import ScrewShapes
 
 TRUE = Screw((0.0, 1.5, 15.0), (0.0, -18.0, 15.0), 1.6, "steel")
 CONFIG = RegistrationConfig(material="steel", stages=(Stage(oversampling=1),), **GRID_OF_SCREWS)

@@ -8,7 +8,7 @@ from small_scene import GRID_OF_SCREWS, drilled_plate, image, pose
 from torchkcreg.geometry import rotation_from_vector
 from torchkcreg.implant import Component, ImplantPointCloud
 from torchkcreg.registration import RegistrationConfig, Stage, Trainer, build_scene
-from torchkcreg.scene.tilts import ComponentTilts
+from torchkcreg.scene.parameter_blocks import ComponentTilts
 
 TIPS = {"left": (0.0, -18.0, 15.0), "right": (0.0, -18.0, -15.0)}
 STAGES = (Stage(oversampling=1, tolerance=1e-4),)

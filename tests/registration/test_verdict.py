@@ -6,11 +6,11 @@ import pytest
 import torch
 from small_scene import RIGID, SCREW, image, pose, scene
 
-from torchkcreg.parameters import ParameterBlock, ParameterBlocks
+from torchkcreg.optimization.parameters import ParameterBlock, ParameterBlocks
 from torchkcreg.registration import RegistrationConfig, RegistrationData, Stage, Trainer
 from torchkcreg.registration.uncertainty import Uncertainty, views_a_side
 from torchkcreg.registration.verdict import Diagnostics, Rival, judge
-from torchkcreg.scene.physics import PhysicsParameters
+from torchkcreg.scene.parameter_blocks import PhysicsParameters
 
 CONFIG = RegistrationConfig(stages=RIGID)
 GOOD = Diagnostics(gc=[0.95, 0.9], misfit=0.01, node_std_mm=0.02, seen=[1.0, 0.8], strain=1e-4)

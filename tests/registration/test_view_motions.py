@@ -10,7 +10,7 @@ from small_scene import RIGID, image, plate, scene
 
 from torchkcreg.io import RunFolder, read_run
 from torchkcreg.registration import RegistrationConfig, RegistrationResult, Stage, register
-from torchkcreg.registration.stage_run import StageRun
+from torchkcreg.registration.stage import StageRun
 from torchkcreg.scene import RegistrationData, ViewMotions, ViewMotionSteps
 from torchkcreg.similarity import GradientDifference
 
@@ -38,7 +38,7 @@ def data() -> RegistrationData:
 def coarse():
     """Coarse pixels tell less of a motion than a scan's."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchkcreg.registration.align._LEAST_STRENGTH", 10.0)
+        patch.setattr("torchkcreg.registration.steps._LEAST_STRENGTH", 10.0)
         yield
 
 

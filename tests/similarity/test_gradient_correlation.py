@@ -5,11 +5,7 @@ import pytest
 import scipy.ndimage
 import torch
 
-from torchkcreg.similarity import (
-    GradientCorrelation,
-    GradientCorrelationLoss,
-    gradient_correlation,
-)
+from torchkcreg.similarity import GradientCorrelation, GradientCorrelationLoss, gradient_correlation
 from torchkcreg.similarity.gradient_correlation import _PIXELS_PER_BLOCK
 
 

@@ -7,11 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from torchkcreg.simulation import (
-    hole_positions,
-    locking_plate,
-    locking_screws,
-)
+from torchkcreg.simulation import hole_positions, locking_plate, locking_screws
 from torchkcreg.simulation.cases import fragment_at
 
 

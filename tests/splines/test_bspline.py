@@ -5,7 +5,7 @@ import torch
 from scipy.interpolate import BSpline
 
 from torchkcreg.splines import cubic_bspline_derivatives, cubic_bspline_weights
-from torchkcreg.splines.bspline import bspline_pieces
+from torchkcreg.splines.basis import bspline_pieces
 
 ETA = torch.linspace(0, 1, 41, dtype=torch.float64)
 

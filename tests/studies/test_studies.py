@@ -11,10 +11,9 @@ import torch
 from torchkcreg.cli import main
 from torchkcreg.geometry import circular_geometry
 from torchkcreg.studies import STUDIES, StudyOptions, run_study, simulated, wrong_geometry
-from torchkcreg.studies.loads import recipe_of, registered_load
-from torchkcreg.studies.simulated import WIDTHS
-from torchkcreg.studies.studies import Study
-from torchkcreg.studies.wrong_geometry import with_source
+from torchkcreg.studies.catalogue import Study
+from torchkcreg.studies.simulated import WIDTHS, with_source
+from torchkcreg.studies.tibial_loads import recipe_of, registered_load
 
 
 def geometry(number=3):
@@ -73,11 +72,11 @@ def row_of(job):
 @pytest.fixture
 def pretended(monkeypatch):
     """Studies whose registrations are pretended."""
-    monkeypatch.setattr("torchkcreg.studies.studies.simulated", row_of)
+    monkeypatch.setattr("torchkcreg.studies.catalogue.simulated", row_of)
     whole = {name: Study(s.text, s.jobs, s.function, s.report) for name, s in STUDIES.items()}
     for name in ("population", "views", "loads"):
         whole[name] = Study(whole[name].text, whole[name].jobs, row_of, whole[name].report)
-    monkeypatch.setattr("torchkcreg.studies.studies.STUDIES", whole)
+    monkeypatch.setattr("torchkcreg.studies.catalogue.STUDIES", whole)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +92,7 @@ def pretended(monkeypatch):
 def test_a_study_writes_table_and_figures_and_is_taken_up(name, files, told, pretended, tmp_path, monkeypatch):
     rows, text = run_study(name, StudyOptions(cases=3), tmp_path / "out", workers=1)
     assert told in text and {path.name for path in (tmp_path / "out").iterdir()} == files | {"jobs.jsonl"}
-    monkeypatch.setattr("torchkcreg.studies.studies.simulated", None)  # nothing is run again
+    monkeypatch.setattr("torchkcreg.studies.catalogue.simulated", None)  # nothing is run again
     assert run_study(name, StudyOptions(cases=3), tmp_path / "out", workers=1) == (rows, text)
 
 
@@ -129,7 +128,7 @@ def test_jobs_that_fail_are_counted_and_all_of_them_are_an_error(monkeypatch, tm
 
     one = STUDIES["population"]
     monkeypatch.setattr(
-        "torchkcreg.studies.studies.STUDIES", {"population": Study(one.text, one.jobs, fails, one.report)}
+        "torchkcreg.studies.catalogue.STUDIES", {"population": Study(one.text, one.jobs, fails, one.report)}
     )
     rows, text = run_study("population", StudyOptions(cases=4), tmp_path / "some", workers=1)
     assert "2 jobs failed, the first with RuntimeError: no memory" in text and rows[3]["nodes"] > 0

@@ -26,7 +26,7 @@ def add_compare(commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import compare_files
+    from torchkcreg.commands import compare_files
 
     found = compare_files(
         options.unloaded,

@@ -34,7 +34,7 @@ def add_convert(commands) -> None:
 
 
 def _convert(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import convert
+    from torchkcreg.commands import convert
 
     said = convert(
         options.source,

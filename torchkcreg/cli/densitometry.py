@@ -26,7 +26,7 @@ def add_densitometry(commands) -> None:
 
 
 def _densitometry(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import densitometry_files
+    from torchkcreg.commands import densitometry_files
 
     found = densitometry_files(
         options.reconstruction,

@@ -18,7 +18,7 @@ def add_doctor(commands) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import doctor
+    from torchkcreg.commands import doctor
 
     text, healthy = doctor()
     return Answer(text, {"healthy": healthy, "lines": text.splitlines()}, 0 if healthy else UNHEALTHY)

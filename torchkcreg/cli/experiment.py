@@ -25,7 +25,7 @@ def add_experiment(commands) -> None:
 
 
 def _experiment(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments.paper import femoral_plate, tibial_plate
+    from torchkcreg.studies.paper import femoral_plate, tibial_plate
 
     run = {"tibial-plate": tibial_plate, "femoral-plate": femoral_plate}[options.name]
     out = options.out or Path(options.name)

@@ -24,7 +24,7 @@ def add_load(commands) -> None:
 
 
 def _load(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import load_files
+    from torchkcreg.commands import load_files
 
     found = load_files(
         options.run_folder,

@@ -27,7 +27,7 @@ def add_plan(commands) -> None:
 
 
 def _plan(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import plan_files
+    from torchkcreg.commands import plan_files
 
     names = ("material", "components", "spectrum", "init", "every", "most")
     given = {name: getattr(options, name) for name in names}

@@ -74,7 +74,7 @@ def _integers(text: str) -> list[int]:
 
 
 def _register(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import RegistrationFiles, dry_run, register_files, register_seeds
+    from torchkcreg.commands import RegistrationFiles, dry_run, register_files, register_seeds
 
     if options.seeds is not None and options.resume:
         raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")

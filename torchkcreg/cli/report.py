@@ -19,7 +19,7 @@ def add_report(commands) -> None:
 
 
 def _report(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import write_report
+    from torchkcreg.commands import write_report
 
     page = write_report(options.folder, out=options.out)
     return Answer(str(page), {"page": page})

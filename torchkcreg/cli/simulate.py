@@ -21,7 +21,7 @@ def add_simulate(commands) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> Answer:
-    from torchkcreg.experiments import simulate_files
+    from torchkcreg.commands import simulate_files
 
     found = simulate_files(options.recipe, options.out, overwrite=options.overwrite, figures=not options.no_figures)
     return Answer(str(found), vars(found))

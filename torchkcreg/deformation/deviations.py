@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchkcreg.mechanics.rigid import rigid_fields
+from torchkcreg.mechanics.holds import rigid_fields
 from torchkcreg.plain import require_keys
 
 _NEAREST = 24

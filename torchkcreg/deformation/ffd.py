@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchkcreg.deformation.group_motion import GroupMotion
-from torchkcreg.deformation.modal_motion import ModalMotion
-from torchkcreg.deformation.model import Level, Motion
-from torchkcreg.deformation.prior import BendingPrior
-from torchkcreg.deformation.spline_field import SplineField
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.splines.grid import ControlPointGrid
+
+from .deformation import Level, Motion
+from .group_motion import GroupMotion
+from .modal_motion import ModalMotion
+from .penalty import BendingPrior
+from .spline_field import SplineField
 
 
 class FreeFormDeformation(SplineField):

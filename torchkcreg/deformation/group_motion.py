@@ -5,20 +5,22 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation.clustering import carrying, cluster_control_points, control_point_volumes
-from torchkcreg.deformation.elasticity import Elasticity
-from torchkcreg.deformation.groups import (
+from torchkcreg.geometry import fit_rigid, rotation_from_vector
+from torchkcreg.implant import ImplantPointCloud
+
+from .deformation import Motion
+from .elasticity import Elasticity
+from .groups import (
+    carrying,
+    cluster_control_points,
+    control_point_volumes,
     control_points_from_groups,
     group_centers,
     moment_features,
     motion_coefficients,
 )
-from torchkcreg.deformation.model import Motion
-from torchkcreg.deformation.penalty import diffusion_penalty
-from torchkcreg.deformation.prior import BendingPrior
-from torchkcreg.deformation.spline_field import SplineField
-from torchkcreg.geometry import fit_rigid, rotation_from_vector
-from torchkcreg.implant import ImplantPointCloud
+from .penalty import BendingPrior, diffusion_penalty
+from .spline_field import SplineField
 
 _CARRIED_PITCH_MM = 1.0
 _SOLID_PITCH_MM = 2.0  # bending is smooth: its energy needs few nodes
@@ -111,7 +113,7 @@ class GroupMotion(Motion):
         return control_points_from_groups(self.grid, self.labels, *self.group_motions(steps))
 
     def penalty(self, steps: Tensor) -> Tensor:
-        """beta R (eq. 5) and the weighted elastic energy."""
+        """Beta R (eq. 5) and the weighted elastic energy."""
         diffusion = diffusion_penalty(self.control_points(steps), self.grid)
         return self.prior.beta * diffusion + self.prior.stiffness * self.elasticity.energy(self.in_grid(steps))
 

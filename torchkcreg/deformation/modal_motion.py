@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation.elasticity import Elasticity
-from torchkcreg.deformation.group_motion import GroupMotion
-from torchkcreg.deformation.model import Motion
+from .deformation import Motion
+from .elasticity import Elasticity
+from .group_motion import GroupMotion
 
 _DIFFERENCE_MM = 1e-3
 _FIT_ITERATIONS = 5

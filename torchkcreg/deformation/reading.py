@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchkcreg.deformation.ffd import FreeFormDeformation
-from torchkcreg.deformation.finite_elements import FiniteElementDeformation
-from torchkcreg.deformation.linear import RigidDeformation
-from torchkcreg.deformation.model import Deformation
 from torchkcreg.mechanics import Superelement
 from torchkcreg.plain import finite_array, require_keys
 from torchkcreg.splines import ControlPointGrid
+
+from .deformation import Deformation
+from .ffd import FreeFormDeformation
+from .finite_elements import FiniteElementDeformation
+from .linear import RigidDeformation
 
 
 def deformation_from_dict(content: Any) -> Deformation:

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchkcreg.deformation.model import Deformation
 from torchkcreg.geometry import fit_rigid, invert_rigid, transform_points
 from torchkcreg.splines import ControlPointGrid, SplineBasis, cell_features, spline_displacement
+
+from .deformation import Deformation
 
 
 class SplineField(Deformation):

@@ -6,10 +6,10 @@ from .alignment import align_to_surface, frame_changes, rigid_coherent_point_dri
 from .bead_shadows import bead_shadows, track_beads
 from .beads import Beads, find_beads
 from .densitometry import MineralContent, mineral_content
-from .displacement import DisplacementMap, displacement_map
+from .displacement_map import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
 from .fragments import Fragments, fragments_of
-from .points import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
+from .point_errors import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
 from .regions import RegionStatistics, cylinder_region, region_statistics
 from .relative_motion import AXES, RelativeMotion, relative_motion
 from .shape import ShapeEvaluation, evaluate_shape

@@ -4,26 +4,25 @@ The world is right-handed in mm with z along the gantry's axis; a view is one 3 
 else about it (source, rays, pixel positions) is derived from that.
 """
 
-from torchkcreg.geometry.calibration import Calibration, calibrate
-from torchkcreg.geometry.circular import circular_geometry, matrices_from_frames
-from torchkcreg.geometry.cone_beam import ConeBeamGeometry
-from torchkcreg.geometry.distance import distance_to
-from torchkcreg.geometry.frames import DetectorFrames, gantry_about_z
-from torchkcreg.geometry.multisource import MultisourceScanner
-from torchkcreg.geometry.packages import from_astra, from_leap, from_leap_cone, from_tigre, to_astra, to_leap
-from torchkcreg.geometry.principal import principal_axes
-from torchkcreg.geometry.se3 import (
+from .calibration import Calibration, calibrate
+from .circular import circular_geometry, matrices_from_frames
+from .cone_beam import ConeBeamGeometry
+from .frames import DetectorFrames, gantry_about_z
+from .multisource import MultisourceScanner
+from .packages import from_astra, from_leap, from_leap_cone, from_tigre, to_astra, to_leap
+from .se3 import (
     across,
     fit_rigid,
     invert_rigid,
+    principal_axes,
     rigid_matrix,
     rotation_about,
     rotation_from_vector,
     transform_points,
     vector_from_rotation,
 )
-from torchkcreg.geometry.two_level_grid import TwoLevelGrid
-from torchkcreg.geometry.volume_grid import VolumeGrid
+from .two_level_grid import TwoLevelGrid
+from .volume_grid import VolumeGrid, distance_to
 
 __all__ = [
     "Calibration",

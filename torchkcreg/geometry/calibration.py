@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torchkcreg.geometry.cone_beam import ConeBeamGeometry
-from torchkcreg.geometry.frames import DetectorFrames
-from torchkcreg.geometry.se3 import rotation_from_vector
+from .cone_beam import ConeBeamGeometry
+from .frames import DetectorFrames
+from .se3 import rotation_from_vector
 
 LIKELY_SHIFT_MM = 20.0  # standard deviations of what is told about a detector's place
 LIKELY_DISTANCE = 0.05  # as a share of the distance from the source

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry.cone_beam import ConeBeamGeometry
+from .cone_beam import ConeBeamGeometry
 
 
 def matrices_from_frames(

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry.checks import checked_matrices, checked_shape
-from torchkcreg.geometry.orientation import looking_signs, turned_towards
 from torchkcreg.precision import ExactModule
+
+from .orientation import checked_matrices, checked_shape, looking_signs, turned_towards
 
 
 class ConeBeamGeometry(ExactModule):

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry.circular import matrices_from_frames
-from torchkcreg.geometry.cone_beam import ConeBeamGeometry
+from .circular import matrices_from_frames
+from .cone_beam import ConeBeamGeometry
 
 ALIKE = 1e-4  # how much pixel steps may differ from view to view, as a share
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from torchkcreg.geometry.circular import circular_geometry
-from torchkcreg.geometry.cone_beam import ConeBeamGeometry
+from .circular import circular_geometry
+from .cone_beam import ConeBeamGeometry
 
 
 def _default_heights() -> dict[str, float]:

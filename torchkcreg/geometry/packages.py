@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry.circular import gantry_axes
-from torchkcreg.geometry.cone_beam import ConeBeamGeometry
-from torchkcreg.geometry.frames import DetectorFrames
+from .circular import gantry_axes
+from .cone_beam import ConeBeamGeometry
+from .frames import DetectorFrames
 
 
 def from_astra(vectors: Tensor, det_shape: Sequence[int]) -> ConeBeamGeometry:

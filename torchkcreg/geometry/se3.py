@@ -12,6 +12,15 @@ from torch import Tensor
 _SMALL_ANGLE_SQUARED = 1e-3  # below it, Taylor series: their first dropped term is under 1e-16
 
 
+def principal_axes(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (3,) of points (N, 3), and unit vectors (3, 3), one a row, from the least variance to the largest.
+
+    Signs are as they come: an axis may point either way.
+    """
+    center = points.mean(0)
+    return center, torch.linalg.eigh((points - center).mT @ (points - center)).eigenvectors.mT
+
+
 def _check_last(name: str, tensor: Tensor, *sizes: int) -> None:
     if tuple(tensor.shape[-len(sizes) :]) != sizes:
         expected = ", ".join(str(size) for size in sizes)

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, interpolate
 
-from .distance import distance_to
-from .volume_grid import VolumeGrid
+from .volume_grid import VolumeGrid, distance_to
 
 
 class TwoLevelGrid:

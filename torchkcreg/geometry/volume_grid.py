@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -120,3 +121,16 @@ def _three(name: str, values: float | Sequence[float]) -> tuple[float, float, fl
     if len(flat) != 3 or not all(math.isfinite(value) for value in flat):
         raise ValueError(f"{name} must be three finite numbers in x, y, z order, got {values}")
     return (flat[0], flat[1], flat[2])
+
+
+def distance_to(filled: Tensor, grid: VolumeGrid) -> Tensor:
+    """Distances (D, H, W) in mm of voxel centres from the nearest voxel that is filled; infinite where none is.
+
+    Args:
+        filled: (D, H, W), true or above zero where the thing is.
+        grid: the voxels.
+    """
+    if not bool((filled > 0).any()):
+        return torch.full(grid.shape, torch.inf)
+    distances = distance_transform_edt((filled <= 0).cpu().numpy(), sampling=tuple(reversed(grid.spacing)))
+    return torch.from_numpy(distances).float()

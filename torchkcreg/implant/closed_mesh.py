@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from torch import Tensor
 
 _FARTHEST_MM = 1e7
 _ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _MOST_BODIES = 1000  # that are looked at one by one
+
+
+def deformed_surface(
+    warp: Callable[[Tensor], Tensor], mesh: trimesh.Trimesh, *, longest_edge_mm: float = 4.0
+) -> trimesh.Trimesh:
+    """The surface of a mesh where a mapping of points takes it.
+
+    Long edges are split first: those of a flat side may run from end to end of a plate and could not bend. Chords of
+    4 mm stay within 2 micrometres of a plate that bends by 3 degrees over 5 cm.
+
+    Args:
+        warp: Maps points (N, 3) of the mesh's frame, mm, float64.
+        mesh: The surface at rest.
+        longest_edge_mm: Edges are split until none is longer.
+
+    Raises:
+        ValueError: the length is not positive.
+    """
+    if not longest_edge_mm > 0:
+        raise ValueError(f"longest_edge_mm must be positive, got {longest_edge_mm}")
+    fine, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest_edge_mm, max_iter=20)
+    vertices = warp(torch.tensor(fine, dtype=torch.float64, device="cpu")).detach().cpu().numpy()
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def closed_triangles(mesh: trimesh.Trimesh) -> np.ndarray:

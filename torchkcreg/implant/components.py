@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torchkcreg.implant.point_cloud import ImplantPointCloud
-from torchkcreg.implant.screws import Screw
+from .point_cloud import ImplantPointCloud
+from .screws import Screw
 
 
 class Component(nn.Module):

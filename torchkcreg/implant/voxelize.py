@@ -10,8 +10,9 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid, transform_points
-from torchkcreg.implant.closed_mesh import closed_triangles
-from torchkcreg.implant.partial_volumes import fill_cells
+
+from .closed_mesh import closed_triangles
+from .partial_volumes import fill_cells
 
 
 def voxelize_mesh(mesh: trimesh.Trimesh, grid: VolumeGrid, *, dtype: torch.dtype = torch.float32) -> Tensor:

@@ -4,20 +4,15 @@ Only this folder touches a disk. What it reads is checked, and an error is one l
 what it writes is there whole or not at all.
 """
 
-from .components import read_components, write_components
 from .config import read_config, write_config
-from .figures import write_figure
-from .files import read_json, write_json, write_text
+from .files import read_json, write_figure, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
-from .init import read_init, write_init
-from .layers import read_layers, write_layers
+from .implants import read_components, read_init, write_components, write_init
 from .matrix_tables import read_matrix_table, write_matrix_table
 from .meshes import MESH_SUFFIXES, WRITTEN_SUFFIXES, read_mesh, write_mesh, write_point_cloud_ply
-from .point_cloud_ply import read_point_cloud_ply
-from .points import read_points, write_points
-from .references import read_reference
+from .point_clouds import read_point_cloud_ply, read_reference, write_points_vtp, write_surface_vtu
 from .rtk_geometry import read_rtk, write_rtk
-from .runs import LAYERS, REPORT, RunFolder, read_run
+from .runs import LAYERS, REPORT, RunFolder, implant_of_run, mesh_of_run, read_layers, read_run, versions, write_layers
 from .scans import (
     ProjectionFile,
     Projections,
@@ -26,11 +21,9 @@ from .scans import (
     write_projections,
     write_stack,
 )
-from .spectra import read_spectrum, write_spectrum
+from .tables import read_points, read_spectrum, write_points, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
-from .versions import versions
 from .volumes import read_volume, write_volume
-from .vtk_xml import write_points_vtp, write_surface_vtu
 
 __all__ = [
     "LAYERS",
@@ -43,8 +36,10 @@ __all__ = [
     "displacement_field",
     "geometry_from_dict",
     "geometry_to_dict",
+    "implant_of_run",
     "implausible_magnification",
     "itk_transform",
+    "mesh_of_run",
     "read_components",
     "read_config",
     "read_geometry",

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchkcreg.io.files import atomic_path
+from .files import atomic_path
 
 _KEY = "array"
 _MOST_IN_JSON = 4096
@@ -53,6 +53,18 @@ def write_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
     """Nothing; writes an NPZ file, whole or not at all."""
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **{name: array.detach().cpu().numpy() for name, array in arrays.items()})  # type: ignore[arg-type]
+
+
+def read_array(path: Path) -> Tensor:
+    """The array of an NPY file."""
+    return torch.from_numpy(np.load(path, allow_pickle=False))
+
+
+def write_array(path: Path, array: Tensor) -> None:
+    """Write an array as an NPY file, whose folder is made where it is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        np.save(temporary, array.numpy())
 
 
 def require_loadable(content: Any, where: str) -> None:

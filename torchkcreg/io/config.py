@@ -8,8 +8,9 @@ from typing import Any
 
 import yaml
 
-from torchkcreg.io.files import read_text, write_text
 from torchkcreg.plain import plain
+
+from .files import read_text, write_text
 
 
 class _Loader(yaml.SafeLoader):

@@ -9,9 +9,12 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchkcreg.plain import plain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TEMPORARY_PREFIX = ".writing-"
 
@@ -80,6 +83,14 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def append_line(path: str | os.PathLike[str], line: str) -> None:
+    """Append a line to a text file, which is made with its folder where it is missing."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{line}\n")
+
+
 def read_text(path: str | os.PathLike[str], what: str) -> str:
     """The text of a file in UTF-8, or in UTF-16 that says so; ValueError names a file that is something else."""
     path = existing_file(path, what)
@@ -104,3 +115,9 @@ def read_json(path: str | os.PathLike[str], what: str) -> Any:
 def write_json(path: str | os.PathLike[str], content: Any, *, indent: int | None = 1) -> None:
     """Nothing; writes `content` as strict JSON, whole or not at all (see `plain` for what it may hold)."""
     write_text(path, json.dumps(plain(content), indent=indent, allow_nan=False) + "\n")
+
+
+def write_figure(path: str | os.PathLike[str], figure: Figure, *, dpi: int = 150) -> None:
+    """Nothing; writes a matplotlib figure, whole or not at all, its format chosen by the suffix (.png, .pdf, .svg)."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.io.files import existing_place, read_json, write_json
-from torchkcreg.io.matrix_tables import SUFFIXES, read_matrix_table, write_matrix_table
-from torchkcreg.io.rtk_geometry import read_rtk, write_rtk
-from torchkcreg.io.scans import image_header, is_dicom, read_dicom_geometry
 from torchkcreg.plain import finite_array, finite_number
+
+from .files import existing_place, read_json, write_json
+from .matrix_tables import SUFFIXES, read_matrix_table, write_matrix_table
+from .rtk_geometry import read_rtk, write_rtk
+from .scans import image_header, is_dicom, read_dicom_geometry
 
 CONVENTION = "u = (P[0].X)/(P[2].X), v = (P[1].X)/(P[2].X); X=(x,y,z,1) in mm; u column, v row, 0-based pixel centres"
 SOURCE_TOLERANCE_MM = 0.1

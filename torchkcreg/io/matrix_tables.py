@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchkcreg.geometry import ConeBeamGeometry, from_astra, to_astra
-from torchkcreg.io.files import atomic_path, write_text
+
+from .files import atomic_path, write_text
 
 SUFFIXES = (".npy", ".npz", ".csv", ".txt")
 LAYOUTS = ("matrices", "astra")

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import re
+import struct
+import subprocess
+import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -12,14 +18,100 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.implant import closed_mesh, scanned_surface
-from torchkcreg.io.files import atomic_path, existing_file
-from torchkcreg.io.step import STEP_SUFFIXES, load_step
-from torchkcreg.io.stl import load_stl
-from torchkcreg.io.volumes import VOLUME_SUFFIXES, read_volume
 
+from .files import atomic_path, existing_file
+from .volumes import VOLUME_SUFFIXES, read_volume
+
+STEP_SUFFIXES = (".step", ".stp")
+DEFLECTION_MM, DEFLECTION_RAD = 0.005, 0.05  # of the surface's triangles from the true one
+SECONDS = 300  # given to a file
+_CONVERT = "import sys, cascadio; _, a, b, mm, rad = sys.argv; cascadio.step_to_glb(a, b, float(mm), float(rad))"
+_HEADER, _TRIANGLE = 84, 50  # bytes
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+_FLAGS = re.MULTILINE | re.IGNORECASE
+_VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)[ \t]*$", _FLAGS)
+_WORDS = [re.compile(rb"^[ \t]*" + word + rb"\b", _FLAGS) for word in (b"facet", b"endfacet", b"solid", b"endsolid")]
 WRITTEN_SUFFIXES = (".stl", ".obj", ".ply", ".off")
 MESH_SUFFIXES = (*WRITTEN_SUFFIXES, ".3mf", *STEP_SUFFIXES)
 _METRES_MM, _SMALLEST_MM, _LARGEST_MM = 1.0, 20.0, 1000.0
+
+
+def load_step(path: Path) -> trimesh.Trimesh:
+    """The surface of all bodies of a STEP file, in mm whatever unit it says, within 5 micrometres.
+
+    Raises:
+        ValueError: damaged, without a body, or cascadio is not installed.
+    """
+    if importlib.util.find_spec("cascadio") is None:
+        raise ValueError("STEP files need cascadio: pip install 'torchkcreg[cad]'")
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "surface.glb"
+        command = [sys.executable, "-c", _CONVERT, str(path), str(target), str(DEFLECTION_MM), str(DEFLECTION_RAD)]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=SECONDS, check=False)
+        except subprocess.TimeoutExpired:
+            raise ValueError(f"it takes longer than {SECONDS} s to be made a surface") from None
+        if done.returncode != 0 or not target.is_file() or target.stat().st_size == 0:
+            raise ValueError("it is no STEP file with a body")
+        try:
+            scene = trimesh.load(str(target), force="mesh", process=False)
+        except Exception as error:  # of a scene without a surface
+            raise ValueError("it holds no surface") from error
+    if not isinstance(scene, trimesh.Trimesh) or len(scene.faces) == 0:
+        raise ValueError("it holds no surface")
+    scene.apply_scale(1000.0)  # GLB is in metres
+    return scene
+
+
+def load_stl(content: bytes) -> trimesh.Trimesh:
+    """The triangles of a binary or ASCII STL file, vertices not merged.
+
+    A name in the first line means nothing, whatever its letters.
+
+    Raises:
+        ValueError: it is cut off, longer than it says, or no STL.
+    """
+    if is_text(content):
+        return _load_text(content)
+    if len(content) < _HEADER:
+        raise ValueError(f"it is no STL: {len(content)} bytes, where a header alone has {_HEADER}")
+    (count,) = struct.unpack_from("<I", content, 80)
+    expected = _HEADER + _TRIANGLE * count
+    if len(content) != expected:
+        what = (
+            "it is cut off or its count is wrong" if len(content) < expected else "its count is wrong or bytes follow"
+        )
+        raise ValueError(f"{what}: {count} triangles take {expected} bytes, it has {len(content)}")
+    return _soup(np.frombuffer(content, _RECORD, count, _HEADER)["corners"])
+
+
+def is_text(content: bytes) -> bool:
+    """Whether an STL is ASCII: binary ones may begin with "solid" too, but their length fits their count."""
+    if not content[:512].lstrip().lower().startswith(b"solid"):
+        return False
+    if len(content) >= _HEADER and len(content) == _HEADER + _TRIANGLE * struct.unpack_from("<I", content, 80)[0]:
+        return False
+    return b"\0" not in content
+
+
+def _load_text(content: bytes) -> trimesh.Trimesh:
+    lines = content.replace(b"\r", b"\n")
+    facets, ends, solids, closed = (len(w.findall(lines)) for w in _WORDS)
+    corners = _VERTEX.findall(lines)
+    if facets != ends or solids != closed or len(corners) != 3 * facets:
+        raise ValueError(
+            f"it is cut off or damaged: {facets} facets begin and {ends} end, with {len(corners)} vertices; "
+            f"{solids} solids begin and {closed} end"
+        )
+    try:
+        return _soup(np.array(corners).astype(np.float64))
+    except ValueError as error:
+        raise ValueError(f"it has a vertex that is no number: {error}") from None
+
+
+def _soup(corners: np.ndarray) -> trimesh.Trimesh:
+    vertices = corners.astype(np.float64).reshape(-1, 3)
+    return trimesh.Trimesh(vertices, np.arange(len(vertices)).reshape(-1, 3), process=False)
 
 
 def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:

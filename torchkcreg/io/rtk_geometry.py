@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.geometry.frames import DetectorFrames
-from torchkcreg.io.files import existing_file, write_text
+
+from .files import existing_file, write_text
 
 ROOT = "RTKThreeDCircularGeometry"
 LARGEST = 1 << 26  # bytes of a file: half a million views

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
+import platform
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchkcreg.deformation import SplineField
 from torchkcreg.geometry import transform_points
-from torchkcreg.io.arrays import require_loadable, with_arrays, without_arrays, write_arrays
-from torchkcreg.io.config import write_config
-from torchkcreg.io.figures import write_figure
-from torchkcreg.io.files import TEMPORARY_PREFIX, atomic_path, read_json, write_json
-from torchkcreg.io.meshes import write_point_cloud_ply
-from torchkcreg.io.transforms import warp, write_displacement_field, write_itk_transform
-from torchkcreg.io.versions import versions
-from torchkcreg.io.vtk_xml import write_points_vtp
 from torchkcreg.plain import plain
-from torchkcreg.registration import RegistrationResult
+from torchkcreg.registration import RegisteredImplant, RegistrationResult
+
+from .arrays import require_loadable, with_arrays, without_arrays, write_arrays
+from .config import read_config, write_config
+from .files import TEMPORARY_PREFIX, atomic_path, read_json, write_figure, write_json
+from .meshes import write_point_cloud_ply
+from .point_clouds import write_points_vtp
+from .transforms import warp, write_displacement_field, write_itk_transform
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_NAMES = ("grey", "overlay", "labels")
+_PACKAGES = ("torchkcreg", "torch", "numpy", "scipy", "kornia", "cma", "trimesh", "SimpleITK", "pydantic")
 CONFIG, VERSIONS, HISTORY, METRICS = "config.yaml", "versions.json", "history.json", "metrics.json"
 DEFORMATION, FIELD, TRANSFORM, CLOUD = "deformation.json", "dvf.mha", "bspline.tfm", "implant_deformed.ply"
 CHECKPOINT, ARRAYS, UNCERTAINTY = "checkpoint.pt", "arrays.npz", "uncertainty.json"
@@ -35,6 +39,76 @@ FIGURES = ("overlay.png", "displacement.png", "history.png")
 _RESULT_FILES = (DEFORMATION, METRICS, UNCERTAINTY, FIELD, TRANSFORM, CLOUD, VTK_CLOUD, ARRAYS)
 RUN_FILES = (CONFIG, VERSIONS, HISTORY, CHECKPOINT, *_RESULT_FILES, *FIGURES, LAYERS, REPORT)
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def write_layers(path: Path, layers: dict[str, Any]) -> None:
+    """Nothing; writes "grey" (V, h, w), "overlay" (V, h, w, 3), both uint8, and "labels" (V,) as an NPZ file."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **{name: layers[name] for name in _NAMES})  # type: ignore[arg-type]
+
+
+def read_layers(path: Path) -> dict[str, Any] | None:
+    """What `write_layers` wrote; None where there is nothing, or it is damaged: a page does without."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            held = {name: file[name] for name in _NAMES}
+    except Exception:  # numpy's, zipfile's and zlib's own
+        return None
+    shape = held["grey"].shape
+    fits = len(shape) == 3 and held["overlay"].shape == (*shape, 3) and held["labels"].shape == shape[:1]
+    return held if fits and held["grey"].dtype == held["overlay"].dtype == np.uint8 else None
+
+
+def versions() -> dict[str, str | int]:
+    """Versions of Python, of the packages the numbers depend on, of the machine, and the number of threads.
+
+    >>> sorted(versions())[:3]
+    ['SimpleITK', 'cma', 'kornia']
+    """
+    found: dict[str, str | int] = {package: _version(package) for package in _PACKAGES}
+    return {
+        **found,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        "threads": torch.get_num_threads(),
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed as a package"
+
+
+def implant_of_run(run_folder: Path, name: str | None = None) -> tuple[RegistrationResult, RegisteredImplant]:
+    """The result of a finished run and its implant of a name, the first one without.
+
+    Raises:
+        FileNotFoundError: If there is no finished run.
+        ValueError: If there is no implant of that name, or a file is damaged.
+    """
+    result = read_run(run_folder)
+    try:
+        return result, result.implant(name)
+    except KeyError as error:
+        raise ValueError(f"run folder {run_folder}: {error.args[0]}") from None
+
+
+def mesh_of_run(run_folder: Path, number: int = 0) -> Path:
+    """The undeformed mesh of an implant of a run, by its number.
+
+    Raises:
+        FileNotFoundError: If the run names none, or it is not there.
+    """
+    files = read_config(Path(run_folder) / "config.yaml").get("files")
+    named = files.get("implant") if isinstance(files, dict) else None
+    path: str | None = named[number] if isinstance(named, list) and named else named  # type: ignore[assignment]
+    if path is None or not Path(path).is_file():
+        where = "names none" if path is None else f"names {path}, which is not there"
+        raise FileNotFoundError(f"the implant's undeformed mesh is needed, and run folder {run_folder} {where}")
+    return Path(path)
 
 
 class RunFolder:

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from torchkcreg.io.files import read_text
+from torchkcreg.physics import Spectrum
+
+from .files import read_text, write_text
 
 _UNITS = {"um", "µm", "mm", "cm", "m", "in", "inch", "ev", "kev", "mev"}
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?", re.ASCII)
 _READINGS = [(";", _POINT), (";", _COMMA), ("\t", _POINT), ("\t", _COMMA), (",", _POINT), (",", _COMMA)]
 _READINGS += [("", _POINT), ("", _COMMA)]  # blanks
+_LARGEST_KEV = 1000.0
 _Rows = list[tuple[int, list[str]]]
 
 
@@ -44,6 +51,13 @@ class Column:
     unit: str = ""
     others: tuple[str, ...] = ()
     any_name: bool = False
+
+
+_COLUMNS = [
+    Column("energy", "keV", ("e", "energies", "photon energy")),
+    Column("weight", "", ("weights", "detected weight", "detected energy weight", "counts", "fluence"), any_name=True),
+]
+_XYZ = [Column(axis, "mm") for axis in "xyz"]
 
 
 def read_table(path: str | os.PathLike[str], what: str, columns: Sequence[Column]) -> NDArray[np.float64]:
@@ -150,3 +164,75 @@ def _name_and_unit(title: str) -> tuple[str, str]:
     words = re.findall(r"[^\W\d_]+\d*", title.lower())
     units = [word for word in words if word in _UNITS]
     return " ".join(word for word in words if word not in _UNITS), units[0] if units else ""
+
+
+def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows as CSV, a column a key; a row without a key leaves its cell empty."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def read_points(path: str | os.PathLike[str]) -> Tensor:
+    """Points (N, 3) float64 in mm from a text table: columns named x, y, z, or three columns without names.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no such table, see `torchkcreg.io.tables.read_table`; the message names the line.
+    """
+    return torch.from_numpy(read_table(path, "points", _XYZ))
+
+
+def write_points(path: str | os.PathLike[str], points: Tensor, **columns: Tensor) -> None:
+    """Nothing; writes points as CSV with a header line, in the given order, to a millionth of a mm.
+
+    Args:
+        path: the file.
+        points: (N, 3) in mm.
+        **columns: further columns by name, each (N,): flags as 0 and 1, numbers with six decimals.
+
+    Raises:
+        ValueError: shapes don't fit, or a point is not finite.
+    """
+    array = points.detach().cpu().double().numpy()
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points must have shape (N, 3), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"points must be finite, but row {int(np.argmin(np.isfinite(array).all(axis=1)))} is not")
+    texts = [[f"{value:.6f}" for value in row] for row in array.tolist()]
+    for name, column in columns.items():
+        if column.shape != points.shape[:1]:
+            raise ValueError(f"column {name} must have shape ({len(points)},), got {tuple(column.shape)}")
+        for row, value in zip(texts, column.tolist()):
+            row.append(f"{value:.6f}" if isinstance(value, float) else str(int(value)))
+    lines = [",".join(["x", "y", "z", *columns]), *(",".join(row) for row in texts)]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
+    """The spectrum of a text table: energy in keV and the weight with which the detector counts it (any scale).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: energies are not positive, not rising, or too large for keV; a weight is negative, or all are 0.
+    """
+    table = read_table(path, "spectrum", _COLUMNS)
+    energies, weights = table[:, 0], table[:, 1]
+    if energies.min() <= 0 or energies.max() > _LARGEST_KEV:
+        raise ValueError(
+            f"spectrum file {path}: energies must be in keV, positive and at most {_LARGEST_KEV:g}, "
+            f"got {energies.min():g} to {energies.max():g}"
+        )
+    try:
+        return Spectrum(tuple(energies.tolist()), tuple(weights.tolist()))
+    except ValueError as error:
+        raise ValueError(f"spectrum file {path}: {error}") from error
+
+
+def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum) -> None:
+    """Nothing; writes a spectrum as `read_spectrum` reads it."""
+    rows = [f"{float(e):.6g},{float(w):.9g}" for e, w in zip(spectrum.energies_kev, spectrum.weights)]
+    write_text(path, "# energy_keV,detected_weight\n" + "\n".join(rows) + "\n")

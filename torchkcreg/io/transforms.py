@@ -12,7 +12,8 @@ from torch import Tensor
 
 from torchkcreg.deformation import Deformation, SplineField
 from torchkcreg.geometry import transform_points
-from torchkcreg.io.files import atomic_path
+
+from .files import atomic_path
 
 _DVF_BLOCK = 65536
 

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid
-from torchkcreg.io.files import atomic_path, existing_file
-from torchkcreg.io.scans import read_image
+
+from .files import atomic_path, existing_file
+from .scans import read_image
 
 VOLUME_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nii", ".nii.gz")
 

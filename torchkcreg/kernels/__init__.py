@@ -1,11 +1,10 @@
 """Operators of torch's dispatcher (`torch.ops.torchkcreg`) and the backends that serve them: a readable reference in
 plain torch for any device, C++ for CPUs (sources in ``csrc``), Triton for GPUs (in ``gpu``). The derivatives are in
-`differentiable`."""
+`differentiable`.
+"""
 
-from .backend import Backend
-from .backends import BACKENDS, backend_names, choose_backend, kernel
+from .backends import BACKENDS, Backend, Operator, backend_names, choose_backend, kernel
 from .extension import PACKAGE, unavailable_reason
-from .operator import Operator
 
 __all__ = [
     "BACKENDS",

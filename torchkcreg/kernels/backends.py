@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from .backend import Backend
 from .extension import unavailable_reason
-from .operator import Operator
 
+_LIBRARY = torch.library.Library("torchkcreg", "FRAGMENT")
 _TRITON = frozenset(
     (
         "blur",
@@ -24,6 +25,60 @@ _TRITON = frozenset(
         "voxel_backproject_weighted",
     )
 )
+
+
+class Operator:
+    """An operator ``torch.ops.torchkcreg.<name>``: what it is called with, what comes out, and a readable definition.
+
+    The definition serves every device for which no backend has a kernel; backends register theirs with the dispatcher,
+    in C++ or in Python. Derivatives are not the operator's, see `torchkcreg.kernels.differentiable`.
+
+    Args:
+        schema: Name and arguments, as `torch.library` takes them.
+        reference: The definition in plain torch, differentiable by autograd.
+        fake: Empty results of the right shapes, for tracing.
+    """
+
+    def __init__(self, schema: str, *, reference: Callable[..., Any], fake: Callable[..., Any]) -> None:
+        self.name, self.reference = schema.partition("(")[0], reference
+        _LIBRARY.define(schema)
+        _LIBRARY.impl(self.name, reference, "CompositeExplicitAutograd")
+        torch.library.register_fake(f"torchkcreg::{self.name}", fake)
+
+    @staticmethod
+    def register(kernels: Mapping[str, Callable[..., Any]], device: str) -> None:
+        """Gives the dispatcher kernels, by the names of their operators, for a type of device such as "CUDA"."""
+        for name, kernel in kernels.items():
+            _LIBRARY.impl(name, kernel, device)
+
+    @property
+    def dispatched(self) -> Callable[..., Any]:
+        """The operator as torch dispatches it, by the device of its arguments."""
+        return getattr(torch.ops.torchkcreg, self.name)
+
+
+@dataclass(frozen=True)
+class Backend:
+    """Something that computes operators on some devices.
+
+    Attributes:
+        name: What users call it.
+        devices: Types of devices that it serves, such as "cpu"; None: every one.
+        unavailable: Makes its kernels ready at the first call; None, or why they cannot be had.
+        operators: Names of the operators that it has kernels for; None: all.
+        is_reference: It is the readable definition, correct and slow.
+    """
+
+    name: str
+    devices: frozenset[str] | None
+    unavailable: Callable[[], str | None]
+    operators: frozenset[str] | None = None
+    is_reference: bool = False
+
+    def serves(self, device: str, operator: str | None) -> bool:
+        """Whether it has a kernel of an operator for a type of device."""
+        on_device = self.devices is None or device in self.devices
+        return on_device and (operator is None or self.operators is None or operator in self.operators)
 
 
 @functools.cache

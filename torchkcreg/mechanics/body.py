@@ -12,11 +12,12 @@ from torch import Tensor
 
 from torchkcreg.geometry import invert_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics.hexahedra import Hexahedra, edge_for, interpolated
-from torchkcreg.mechanics.rigid import rigid_fields
-from torchkcreg.mechanics.stiffness import stiffness_matrix
-from torchkcreg.mechanics.stress import StressField, volumes_in_cubes
 from torchkcreg.physics import ElasticConstants
+
+from .hexahedra import Hexahedra, edge_for, interpolated
+from .holds import rigid_fields
+from .stiffness import stiffness_matrix
+from .stress import StressField, volumes_in_cubes
 
 _INERTIA_PITCH_MM = 1.0  # what is left over of loads is carried evenly; any even distribution will do
 

@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.mechanics.expected_loads import ExpectedLoads
-from torchkcreg.mechanics.sections import Sections
-from torchkcreg.mechanics.stress import StressField, deviator, von_mises
-from torchkcreg.mechanics.superelement import Superelement
+from .sections import Sections
+from .stress import StressField, deviator, von_mises
+from .superelement import ExpectedLoads, Superelement
 
 _SECTIONS = 121
 _AT_ONCE = 1024

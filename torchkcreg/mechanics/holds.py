@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchkcreg.implant import Hole, ImplantPointCloud
-from torchkcreg.mechanics.rigid import rigid_fields
 
 _RIM_MM = 1.5  # around a hole's wall: what a screw's head presses on
 _JOINED = 2.2  # radii between centres: round holes that open into each other
@@ -18,6 +17,14 @@ _SPACING = 3.0  # of patches, in widths of the implant's cross-section; at least
 _MOST_PATCHES = 12
 _FEWEST_HOLES = 3
 _SPANNED = 0.5  # of the implant's length, by the holes that hold it
+
+
+def rigid_fields(positions: Tensor) -> Tensor:
+    """Displacements (6, N, 3) of positions (N, 3) by a unit shift along each axis, and a unit small turn about each."""
+    axes = torch.eye(3, dtype=positions.dtype, device=positions.device)
+    shifts = axes[:, None].expand(3, len(positions), 3)
+    turns = torch.linalg.cross(axes[:, None].expand_as(shifts), positions[None].expand_as(shifts))
+    return torch.cat([shifts, turns])
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ from scipy.sparse import coo_array, csr_array
 from torch import Tensor
 
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics.hexahedra import NODES, Hexahedra
 from torchkcreg.physics import ElasticConstants
+
+from .hexahedra import NODES, Hexahedra
 
 _FILLING = 1e-7  # of the metal's stiffness: what the rest of a cube is made of
 _PLACES = 5

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics.hexahedra import Hexahedra, quadratics
 from torchkcreg.physics import ElasticConstants
+
+from .hexahedra import Hexahedra, quadratics
 
 _NODES = (0, 2, 6, 8, 9, 11, 15, 17, 18, 20, 24, 26)  # of a cube's 27: three through the thickness, two across it
 _FULL_ENOUGH = 0.5  # of a cube that is full: what is in it then holds all of its shape functions

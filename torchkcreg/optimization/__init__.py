@@ -1,5 +1,6 @@
 """Optimisers behind ask and tell, and the names that stages call them by. One of your own is a class like these, and a
-line here or an argument of `register`."""
+line here or an argument of `register`.
+"""
 
 from collections.abc import Callable
 

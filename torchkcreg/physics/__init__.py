@@ -1,23 +1,24 @@
 """Materials, spectra, intensity models and the detector: what turns path lengths in mm into measured line integrals."""
 
-from torchkcreg.physics.beam import Beam
-from torchkcreg.physics.blur import gaussian_blur, gaussian_kernel
-from torchkcreg.physics.detector import COUNT_FLOOR, line_integrals_from_intensity
-from torchkcreg.physics.elastic_constants import ElasticConstants, elastic_constants, is_elastic
-from torchkcreg.physics.intensity import IdentityIntensity, PolyenergeticTransmission, intensity_from_dict
-from torchkcreg.physics.intensity_model import FreeParameter, IntensityModel
-from torchkcreg.physics.materials import (
+from .beam import Beam
+from .blur import gaussian_blur, gaussian_kernel
+from .detector import COUNT_FLOOR, line_integrals_from_intensity
+from .intensity import FreeParameter, IdentityIntensity, IntensityModel, PolyenergeticTransmission, intensity_from_dict
+from .materials import (
+    ElasticConstants,
     Material,
     calcium_attenuation,
     calcium_in_water,
     calcium_of,
+    elastic_constants,
+    is_elastic,
     material,
     material_names,
     mixture,
 )
-from torchkcreg.physics.scatter import Veil, scatter_shapes, scattered_signal, veil_image
-from torchkcreg.physics.spectra import Spectrum, tungsten_spectrum
-from torchkcreg.physics.transmission import transmission
+from .scatter import Veil, scatter_shapes, scattered_signal, veil_image
+from .spectra import Spectrum, tungsten_spectrum
+from .transmission import transmission
 
 __all__ = [
     "COUNT_FLOOR",

@@ -8,10 +8,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchkcreg.physics.materials import Material, material
-from torchkcreg.physics.spectra import Spectrum
-from torchkcreg.physics.transmission import transmission
 from torchkcreg.precision import ExactModule
+
+from .materials import Material, material
+from .spectra import Spectrum
+from .transmission import transmission
 
 
 class Beam(ExactModule):

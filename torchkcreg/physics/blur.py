@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchkcreg.differentiable import linear
 from torchkcreg.kernels import Operator, choose_backend
+from torchkcreg.kernels.differentiable import linear
 
 NUM_SIGMAS = 4.5
 SMALLEST_SIGMA = 1e-3

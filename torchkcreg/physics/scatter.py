@@ -1,5 +1,6 @@
 """Broad scatter: two images from what is measured, with levels that a registration estimates, or a veil, a share of the
-primary, that is fitted to the air around an object and taken from projections."""
+primary, that is fitted to the air around an object and taken from projections.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from torchkcreg.physics.blur import gaussian_blur
+from .blur import gaussian_blur
 
 _AIR_WITHIN_MM = 20.0  # on the detector, of its left and right border
 _ITERATIONS = 40

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchkcreg.differentiable import differentiable
 from torchkcreg.kernels import Operator, choose_backend
-from torchkcreg.physics.blur import convolve_by
+from torchkcreg.kernels.differentiable import differentiable
+
+from .blur import convolve_by
 
 
 def transmission(

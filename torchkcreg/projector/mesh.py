@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchkcreg.differentiable import differentiable
 from torchkcreg.kernels import Operator, choose_backend
+from torchkcreg.kernels.differentiable import differentiable
 from torchkcreg.precision import full_precision
-from torchkcreg.projector.mesh_reference import integrate_triangles
+
+from .mesh_reference import integrate_triangles
 
 
 @full_precision
@@ -72,7 +73,7 @@ def _signed_depths(projected: Tensor, faces: Tensor, det_shape: tuple[int, int],
 
 
 class _MeshKernel:
-    """The kernel of one mesh and detector; its derivatives by `torchkcreg.differentiable`."""
+    """The kernel of one mesh and detector; its derivatives by `torchkcreg.kernels.differentiable`."""
 
     def __init__(self, faces: Tensor, det_shape: tuple[int, int]) -> None:
         self._faces, self._det_shape = faces, det_shape

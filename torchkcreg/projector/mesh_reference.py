@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchkcreg.differentiable import is_transformed
+from torchkcreg.kernels.differentiable import is_transformed
 
 MAX_PAIRS = 1 << 20  # (triangle, pixel) pairs looked at together
 MAX_CLIPPED_PAIRS = 1 << 14  # pairs clipped together: what they need stays in a core's cache

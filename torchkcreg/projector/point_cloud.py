@@ -9,7 +9,7 @@ from torchkcreg.kernels import choose_backend
 from torchkcreg.precision import full_precision
 
 from .footprint import Footprint, cell_footprint
-from .ops import POINT_DRR, point_drr
+from .point_ops import POINT_DRR, point_drr
 
 
 @full_precision

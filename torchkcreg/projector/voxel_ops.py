@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from torchkcreg.differentiable import linear
 from torchkcreg.kernels import Operator, kernel
+from torchkcreg.kernels.differentiable import linear
 
-from .voxel_reference import backproject_by_planes, project_by_planes
-from .voxel_weighted_reference import backproject_by_voxels, spread_over_images
+from .voxel_reference import backproject_by_planes, backproject_by_voxels, project_by_planes, spread_over_images
 
 _Map = Callable[[Tensor], Tensor]
 

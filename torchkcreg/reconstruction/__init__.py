@@ -6,17 +6,14 @@ is the fast way around known metal (KC-MAR).
 """
 
 from torchkcreg.physics import Veil, veil_image
-from torchkcreg.scene import KnownComponent
 
 from .beam_estimate import BeamEstimate, estimate_beam
 from .corrections import fit_veil, floored_line_integrals, refined_scatter
-from .ct_numbers import hounsfield
-from .dead_pixels import filled
 from .decomposition import Decomposition, decompose
 from .fdk import FDKConfig, fdk
 from .field_of_view import coverage, field_of_view_grid
-from .inpainting import inpainted
-from .known_component import (
+from .inpainting import filled, inpainted
+from .kcrec import (
     component_path_lengths,
     component_shares,
     known_materials,
@@ -24,18 +21,12 @@ from .known_component import (
     with_components,
     without_components,
 )
-from .preparation import PreparedData, prepare
-from .pwls import PWLS, pwls
-from .pwls_config import PWLSConfig
-from .reconstructed import Reconstruction
-from .roughness import Roughness, VoxelRoughness, quadratic_roughness
-from .sharding import ViewShard
-from .single_material import path_lengths_through
-from .spectral import BeamModel, background_line_integrals, behind_metal, mineral_part
-from .subsets import ordered_subsets
-from .system import System, VoxelSystem
+from .preparation import PreparedData, prepare, statistical_weights
+from .pwls import PWLS, PWLSConfig, Reconstruction, ordered_subsets, pwls
+from .scan_views import ViewShard
+from .spectral import BeamModel, background_line_integrals, behind_metal, hounsfield, mineral_part, path_lengths_through
+from .system import Roughness, System, VoxelRoughness, VoxelSystem, quadratic_roughness
 from .two_levels import TwoLevelRoughness, TwoLevelSystem
-from .weights import statistical_weights
 from .workflow import IterativeResult, reconstruct
 
 __all__ = [
@@ -45,7 +36,6 @@ __all__ = [
     "Decomposition",
     "FDKConfig",
     "IterativeResult",
-    "KnownComponent",
     "PWLSConfig",
     "PreparedData",
     "Reconstruction",

@@ -13,18 +13,30 @@ import numpy as np
 import torch
 from scipy.optimize import brentq, least_squares
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import Beam, Spectrum, Veil, material, tungsten_spectrum
 from torchkcreg.progress import progress_bar
-from torchkcreg.scene import KnownComponent
 
-from .corrections import scatter_image
-from .dead_pixels import filled_transmission
-from .known_component import component_path_lengths, known_materials, unknown_share
-from .metal_shadow import MetalShadow, metal_shadow
+from .corrections import floored_line_integrals, scatter_image
+from .fdk import fdk
+from .inpainting import filled_transmission, inpainted
+from .kcrec import component_path_lengths, known_materials, unknown_share, without_components
 from .spectral import BeamModel
+from .system import VoxelSystem, projected
 
+FEWEST_PIXELS = 200
+MOST_PIXELS = 5000
+LEAST_MM = 0.5  # of metal in a pixel that is used
+LEAST_PER_MM = 0.1  # attenuation of the lightest implant alloys, 1/mm, less than that
+STEEPEST = 0.15  # change of the metal's length to the next pixel, as a share: rims are averages of exponentials
+LEAST_TRANSMISSION = 0.003  # below it nothing is left of the beam that tells anything
+BACKGROUND = 0.03  # of a line integral: the interpolated background's error
+NOISE = 2e-3  # of a transmission
+NEAR_MODE = 0.06  # of water: what is taken for the same tissue
+TISSUE_RANGE = (0.85, 1.15)  # of water: what most of an object is beyond that is no soft tissue
 TUBE_KVP = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0)  # packaged spectra, from among which the nearest is taken
 NUM_BINS = 12
 INDEPENDENT = 400  # pixels: what is wrong with the background or the scatter is so over many of them
@@ -35,6 +47,78 @@ UNLIKELY = 3.0  # so many of these are told
 SCATTER = 0.05  # of the scatter that was fitted to the air
 TISSUE = 0.02  # of the attenuation of the soft tissue that most of an object is, beside water
 KNOWN_TISSUE = 0.003  # of the same, where it is known
+
+
+@dataclass(frozen=True)
+class MetalShadow:
+    """Pixels behind metal: path lengths (M, N); all others (N,). And what stands around the metal."""
+
+    lengths: Tensor
+    primary: Tensor
+    scatter: Tensor
+    background: Tensor  # its line integrals
+    deviation: Tensor  # of the primary
+    typical: float  # line integral around the metal, as measured
+    tissue: float  # what most of the object is, over water, if the beam is `start`; nan where it is no soft tissue
+    start: BeamModel
+
+
+def metal_shadow(
+    primary: Tensor,
+    scatter: Tensor,
+    metal: Tensor,
+    unknown: Tensor,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    beam: BeamModel,
+    mask: Tensor | None,
+    backend: str,
+) -> MetalShadow:
+    """Pixels behind smooth metal, and the background in them out of a reconstruction around the metal's shadow."""
+    lines = floored_line_integrals(primary)
+    everything = [(slice(None), beam.weights[:, None, None, None])]
+    around = inpainted(without_components(lines, everything, beam)[0], metal, mask=mask)
+    volume = fdk(around, geometry, grid, backend=backend).clamp_min(0)
+    system = VoxelSystem(geometry, grid, backend=backend)
+    seen, displaced = projected(system, volume), projected(system, volume * (1 - unknown))
+    # what the volume lacks is as around the shadow, and where there is metal there is nothing else
+    background = seen + inpainted(around - seen, metal, mask=mask) - displaced
+    total = metal.sum(0)
+    steps = max_pool2d(total[:, None], 3, 1, 1)[:, 0] + max_pool2d(-total[:, None], 3, 1, 1)[:, 0]
+    behind = torch.exp(-background) * torch.exp(-LEAST_PER_MM * total)
+    used = (total > LEAST_MM) & (steps < STEEPEST * total) & (behind > LEAST_TRANSMISSION)
+    if mask is not None:
+        used &= mask != 0
+    places = used.flatten().nonzero()[:, 0]
+    if len(places) < FEWEST_PIXELS:
+        raise ValueError(
+            f"only {len(places)} pixels lie behind smooth metal, too few to tell the beam: give a spectrum"
+        )
+    places = places[:: max(1, len(places) // MOST_PIXELS)]
+    at = lambda image: image.flatten()[places].double()  # noqa: E731
+    expected = at(primary).clamp_min(LEAST_TRANSMISSION)
+    return MetalShadow(
+        metal.flatten(1)[:, places].double(),
+        at(primary),
+        at(scatter),
+        at(background),
+        (NOISE**2 + (BACKGROUND * expected) ** 2).sqrt(),
+        float(lines[(total == 0) & (lines > lines.max() / 10)].median()),
+        _tissue(volume, beam.water),
+        beam,
+    )
+
+
+def _tissue(volume: Tensor, water: float) -> float:
+    """What most of an object is, over water; nan where that is no soft tissue."""
+    low, high = 0.5, 2.0
+    counts = torch.histc(volume / water, bins=150, min=low, max=high)
+    counts = torch.nn.functional.avg_pool1d(counts[None], 5, 1, 2)[0]
+    mode = low + (float(counts.argmax()) + 0.5) * (high - low) / len(counts)
+    if not TISSUE_RANGE[0] < mode < TISSUE_RANGE[1]:
+        return float("nan")
+    share = volume / water
+    return float(share[(share - mode).abs() < NEAR_MODE].median())
 
 
 @dataclass(frozen=True)

@@ -4,22 +4,147 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from torchkcreg.callbacks import Callback
+from torchkcreg.options import Config
 from torchkcreg.progress import progress_bar
 
-from .pwls_config import PWLSConfig
-from .reconstructed import Reconstruction
-from .roughness import Roughness, VoxelRoughness
-from .sharding import ViewShard
-from .subsets import ordered_subsets
-from .system import System
+from .scan_views import ViewShard
+from .system import Roughness, System, VoxelRoughness
 
+PRESETS = ("momentum", "paper")
 BLOCK_VIEWS = 16  # projected together outside of subsets, to bound memory
+
+
+def ordered_subsets(num_views: int, num_subsets: int, *, sources: Sequence[str] | None = None) -> list[list[int]]:
+    """Views of each subset, in the order in which to visit them.
+
+    Views are dealt out like cards, focal spot by focal spot. Taking every n-th view instead would give subsets of one
+    focal spot each where the firing order's period divides n. Subsets are visited in bit-reversed order, so that one
+    differs as much as can be from those before.
+
+    Args:
+        num_views: V.
+        num_subsets: at most V.
+        sources: label of each view.
+
+    Raises:
+        ValueError: a number of subsets that is not between 1 and V, or labels that don't match.
+
+    >>> ordered_subsets(8, 2, sources=list("ababcdcd"))
+    [[0, 1, 4, 5], [2, 3, 6, 7]]
+    """
+    if not 1 <= num_subsets <= num_views:
+        raise ValueError(f"subsets must be between 1 and the number of views {num_views}, got {num_subsets}")
+    labels = [""] * num_views if sources is None else list(sources)
+    if len(labels) != num_views:
+        raise ValueError(f"sources must have one entry for each of {num_views} views, got {len(labels)}")
+    dealt = [view for label in sorted(set(labels)) for view in range(num_views) if labels[view] == label]
+    return [dealt[start::num_subsets] for start in bit_reversed(num_subsets)]
+
+
+def bit_reversed(count: int) -> list[int]:
+    """The numbers below count in the order of their reversed bits.
+
+    >>> bit_reversed(6)
+    [0, 4, 2, 1, 5, 3]
+    """
+    bits = max(1, (count - 1).bit_length())
+    return [n for n in (int(f"{i:0{bits}b}"[::-1], 2) for i in range(1 << bits)) if n < count]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A reconstructed volume.
+
+    Attributes:
+        volume: attenuation (D, H, W), 1/mm.
+        history: one record an iteration: iteration, subsets, objective (exact where asked for, else None), estimate
+            (the objective with each subset's residual as it was met), change (RMS over the voxels, 1/mm), seconds.
+    """
+
+    volume: Tensor
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class SubsetStage:
+    """Some iterations with one number of ordered subsets.
+
+    Attributes:
+        iterations: how many.
+        subsets: how many.
+        momentum: whether steps start from a point ahead.
+    """
+
+    iterations: int
+    subsets: int
+    momentum: bool = True
+
+    def check(self, num_views: int) -> None:
+        """Nothing; ValueError where there are more subsets than views."""
+        if self.subsets > num_views:
+            raise ValueError(f"subsets must be at most the number of views {num_views}, got {self.subsets}")
+
+
+class PWLSConfig(Config):
+    """Options of `pwls`.
+
+    Attributes:
+        iterations: passes through all views.
+        subsets: ordered subsets at the start.
+        momentum: Nesterov's momentum. The number of subsets then halves after each quarter of the iterations, which
+            keeps the errors of subsets from adding up in the momentum and lets the run converge.
+        beta: weight of the roughness, in the unit of the weights times mm^2.
+        nonnegative: no attenuation below zero.
+        objective_every: compute the exact objective after every so many iterations (half as much work as an iteration);
+            0: never.
+
+    >>> PWLSConfig.preset("paper").stages()
+    [SubsetStage(iterations=500, subsets=20, momentum=False)]
+    """
+
+    iterations: int = Field(50, ge=1)
+    subsets: int = Field(20, ge=1)
+    momentum: bool = True
+    beta: float = Field(10.0, ge=0, allow_inf_nan=False)
+    nonnegative: bool = True
+    objective_every: int = Field(0, ge=0)
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> PWLSConfig:
+        """Named options: "paper", 500 iterations of 20 subsets (Cao et al. 2020); "momentum", 50 with momentum."""
+        if name not in PRESETS:
+            raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}")
+        if name == "paper":
+            return cls(**({"iterations": 500, "subsets": 20, "momentum": False} | changes))
+        return cls(**changes)
+
+    def stages(self) -> list[SubsetStage]:
+        """The run's stages."""
+        if not self.momentum:
+            return [SubsetStage(self.iterations, self.subsets, False)]
+        quarters = [self.iterations * (i + 1) // 4 - self.iterations * i // 4 for i in range(4)]
+        stages = []
+        for count, part in zip(quarters, range(4)):
+            if count:
+                stages.append(SubsetStage(count, max(1, self.subsets >> part)))
+        return stages
+
+    def stage(self, iteration: int) -> SubsetStage:
+        """The stage of an iteration, counted from 0."""
+        stages = self.stages()
+        for stage in stages:
+            if iteration < stage.iterations:
+                return stage
+            iteration -= stage.iterations
+        return stages[-1]
 
 
 class PWLS:

@@ -11,8 +11,7 @@ from torch.nn.functional import avg_pool2d
 from torchkcreg.geometry import ConeBeamGeometry, TwoLevelGrid
 from torchkcreg.geometry.two_level_grid import means, repeated
 
-from .roughness import pair_curvature, pair_gradient, pair_roughness
-from .system import VoxelSystem
+from .system import VoxelSystem, pair_curvature, pair_gradient, pair_roughness
 
 
 class TwoLevelSystem(nn.Module):

@@ -13,20 +13,17 @@ from torch import Tensor
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import ConeBeamGeometry, TwoLevelGrid, VolumeGrid
+from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import Beam, Veil
 from torchkcreg.progress import progress_bar
-from torchkcreg.scene import KnownComponent
 
 from .corrections import refined_scatter, scatter_image
-from .known_component import component_shares, unknown_share
+from .kcrec import component_shares, unknown_share
 from .preparation import PreparedData, prepare
-from .pwls import PWLS
-from .pwls_config import PWLSConfig
-from .roughness import VoxelRoughness
-from .scan_views import ReadViews, Workspace, views_reader
-from .sharding import ViewShard
+from .pwls import PWLS, PWLSConfig
+from .scan_views import ReadViews, ViewShard, Workspace, views_reader
 from .spectral import BeamModel, mineral_part, transmitted_behind
-from .system import VoxelSystem
+from .system import VoxelRoughness, VoxelSystem
 from .two_levels import TwoLevelRoughness, TwoLevelSystem
 
 log = logging.getLogger(__name__)

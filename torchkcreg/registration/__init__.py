@@ -4,18 +4,17 @@ from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import OPTIMIZERS, Optimizer, Progress
 from torchkcreg.scene import RegistrationData, Scene, with_background
 
-from .callbacks import ProgressBar, TrainerState
 from .config import RegistrationConfig, Stage, preset_stages
-from .models import Implant
+from .implant import Implant
 from .objective import Objective
 from .planning import PlannedSet, ViewInformation, view_information
 from .register import build_scene, register
 from .registered_implant import RegisteredImplant
 from .result import RegistrationResult
-from .screws import find_screws
-from .stage_run import StageRun, Terms, similarities
+from .screw_search import find_screws
+from .stage import StageRun, Terms, similarities
 from .steps import AFTER, BEFORE
-from .trainer import StageRecord, Trainer
+from .trainer import ProgressBar, StageRecord, Trainer, TrainerState
 
 __all__ = [
     "AFTER",

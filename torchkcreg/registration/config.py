@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from torchkcreg.config import Config
 from torchkcreg.deformation import BendingPrior, Level
+from torchkcreg.options import Config
 
 SimilarityName = Literal["gradient-correlation", "gradient-difference"]
 DeformationName = Literal["auto", "ffd", "modes", "fe"]

@@ -13,7 +13,7 @@ from torchkcreg.scene import RegistrationData, Scene
 from torchkcreg.similarity import GradientCorrelation, GradientDifference
 
 from .config import RegistrationConfig, Stage, binning
-from .prepared import data_with_background
+from .estimated_background import data_with_background
 
 _PIXEL_MM = 1.5  # nothing finer is needed to see that a stage went astray
 _LOST = 1.25  # times what was unexplained before: a stage sees other pixels than its judge

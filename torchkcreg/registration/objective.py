@@ -7,17 +7,42 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torchkcreg.physics import gaussian_blur
 from torchkcreg.scene import Moves, Scene, State, View
 from torchkcreg.similarity import Similarity, sobel_gradient
 
-from .robust import residual_weights
 from .uncertainty import Uncertainty, views_a_side
 
+_EDGE = 0.05  # a pixel lies on an edge of the model if its squared gradient has this share of the largest
+_WINDOW_PX = 2.0
 Penalty = Callable[[State], Tensor]
 SimilarityFactory = Callable[[Tensor, Tensor | None, Tensor | None], Similarity]
-
 _PROBES = 4  # steps that tell how much more sharp images change than coarse ones
 _NODES_AT_ONCE = 5_000_000  # of all candidates that are rendered together: 60 MB of positions
+
+
+def residual_weights(residuals: Tensor, rendered: Tensor, valid: Tensor) -> Tensor:
+    """Weights (V, rows, cols), 1 where the model fits, towards 0 where it does not.
+
+    ``w = 1 / (1 + e / m)`` with e the squared residual, averaged over a few pixels, and m its median over the edges of
+    the rendered image: the weights of a Cauchy distribution for iteratively reweighted least squares (Holland & Welsch
+    1977). The scale is the residual on the implant's own edges, so that a view in which the model fits badly
+    everywhere keeps its weights.
+
+    Args:
+        residuals: Of the unit gradients, shape (V, 2, rows, cols).
+        rendered: Gradients of the rendered images, shape (V, 2, rows, cols).
+        valid: Pixels that count, shape (V, rows, cols).
+    """
+    valid = valid.to(residuals)
+    energy = gaussian_blur(residuals.square().sum(1) * valid, _WINDOW_PX)
+    edges = rendered.square().sum(1) * valid
+    weights = torch.ones_like(energy)
+    for view, (misfit, edge) in enumerate(zip(energy, edges, strict=True)):
+        on_edge = edge > _EDGE * edge.max()
+        if on_edge.any():
+            weights[view] = 1 / (1 + misfit / misfit[on_edge].median().clamp_min(torch.finfo(misfit.dtype).tiny))
+    return weights
 
 
 class Objective:

@@ -14,8 +14,8 @@ from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.scene import RegistrationData, Scene
 
 from .config import RegistrationConfig
-from .prepared import facing_data
-from .stage_run import StageRun
+from .estimated_background import facing_data
+from .stage import StageRun
 from .uncertainty import likeness
 
 _BIN = 8  # expected errors need no finer pixels

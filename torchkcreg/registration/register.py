@@ -21,10 +21,10 @@ from torchkcreg.physics import (
 from torchkcreg.scene import Assembly, RegistrationData, Scene
 
 from .config import RegistrationConfig
-from .models import DeformationFactory, Implant, deformation_of
+from .implant import DeformationFactory, Implant, deformation_of
 from .objective import Penalty, SimilarityFactory
 from .result import RegistrationResult
-from .stage_run import Step, Terms
+from .stage import Step, Terms
 from .trainer import Trainer
 
 

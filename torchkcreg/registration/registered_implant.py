@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchkcreg.deformation import Deformation, Deviations, deformation_from_dict
 from torchkcreg.geometry import transform_points
-from torchkcreg.implant import ImplantPointCloud, Screw, deformed_surface
+from torchkcreg.implant import ImplantPointCloud, KnownComponent, Screw, deformed_surface
 from torchkcreg.plain import finite_array, require_keys
-from torchkcreg.scene import Assembly, KnownComponent, followed_motion
+from torchkcreg.scene import Assembly, followed_motion
 
 _BENT_EDGE_MM = 2.0
 _NODES_PITCH_MM = 1.0
@@ -79,7 +79,7 @@ class RegisteredImplant:
 
     @torch.no_grad()
     def displacement(self, points: Tensor) -> Tensor:
-        """u (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64 and that frame."""
+        """U (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64 and that frame."""
         flat = points.detach().to(self.implant_to_world).reshape(-1, 3)
         return self.deformation.displacement(flat).reshape(points.shape)
 

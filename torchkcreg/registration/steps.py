@@ -5,22 +5,121 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
-from torchkcreg.scene import Assembly, ViewMotions
+from torchkcreg.scene import Assembly, Moves, ViewMotions
 
-from .align import view_evidence
-from .basins import places
 from .config import Stage
-from .screws import find_screws, of_best_metal, screws_by_metal
-from .stage_run import StageRun, Step, coarse
+from .objective import Objective
+from .screw_search import find_screws, of_best_metal, screws_by_metal
+from .stage import StageRun, Step, coarse
 from .verdict import Rival
 
+_WEIGHINGS = 2
+_LEAST_STRENGTH = 25.0  # in simulations up to 16 where the geometry was right, 70 and more where it was off by 0.3 mm
+_STEP_MM = 2.0  # a coarse image's optimum is a few mm wide
+_WORSE = 1.5  # times the least loss: what fits no better is no candidate
+_MOST = 3
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
 _FEWEST_VIEWS = 2  # one alone is at odds with none
 _LOOKS = ("find_screws", "choose_screws")
+
+
+class ViewEvidence(NamedTuple):
+    """What motions of the views would explain of the images.
+
+    Attributes:
+        motion_mm: How far the likeliest of them move the nodes, root mean square over the views.
+        strength: By how much the loss would fall, in losses of a deviation for each of their parameters that the images
+            determine: about one where nothing moved.
+    """
+
+    motion_mm: float
+    strength: float
+
+    @property
+    def is_strong(self) -> bool:
+        """Whether the views have moved."""
+        return self.strength > _LEAST_STRENGTH
+
+
+def view_evidence(objective: Objective) -> ViewEvidence:
+    """What motions of the views would explain beside all else that is free in an objective; their prior is weighed.
+
+    A deviation is measured by what would be left of the residual images where the views had moved: what they are at
+    odds about now may be all that is left.
+    """
+    rest = objective.at_rest[0]
+    jacobian, residuals = objective.jacobian(rest)
+    left = residuals
+    for _ in range(_WEIGHINGS):
+        objective.moves["views"].weigh(objective.uncertainty_from(jacobian, left, rest).loss_of_a_deviation)
+        known = objective.uncertainty_from(jacobian, left, rest)  # with that weight
+        slope = 0.5 / len(residuals) * (jacobian.flatten(1) @ residuals.flatten()).double()
+        slope = slope + _slope(objective, rest)
+        step, gain, number = _best(known.images + known.penalties, known.images, slope)
+        left = residuals + torch.einsum("d,dvkij->vkij", step.to(jacobian), jacobian)
+    views = objective.moves.places["views"]
+    others = torch.ones_like(slope, dtype=torch.bool)
+    others[views] = False
+    images, whole = (m[others][:, others] for m in (known.images, known.images + known.penalties))
+    _, less, fewer = _best(whole, images, slope[others])
+    motion = step[views].unflatten(0, (-1, 6)).square().sum(-1).mean().sqrt()
+    told = (number - fewer).clamp_min(1.0)
+    return ViewEvidence(float(motion), float((gain - less) / (known.loss_of_a_deviation * told)))
+
+
+def _slope(objective: Objective, at: Tensor) -> Tensor:
+    """Gradient (D,) of what speaks against parameters (D,) but the images."""
+    leaf = at.clone().requires_grad_(True)
+    (slope,) = torch.autograd.grad(objective.penalty(leaf[None])[0], leaf)
+    return slope
+
+
+def _best(curvature: Tensor, images: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The step to the optimum, by how much the loss falls on it, and how many parameters the images determine."""
+    same = torch.eye(len(curvature), dtype=curvature.dtype, device=curvature.device)
+    inverse = torch.linalg.inv(curvature + 1e-9 * curvature.diagonal().mean() * same)
+    step = -inverse @ slope
+    return step, -0.5 * slope @ step, (inverse @ images).trace()
+
+
+@torch.no_grad()
+def places(objective: Objective, found: Tensor) -> list[Tensor]:
+    """Parameters (D,) of a rigid stage from which the registration is worth trying, that found first.
+
+    Others are where the loss has a minimum along an implant's long axis, up to half its length away, and the start,
+    where the stage left it by more than a few steps: coarse pixels may prefer another place without seeing the holes.
+
+    Args:
+        objective: Of a rigid stage.
+        found: Where the stage ended, shape (D,).
+    """
+    moves, others = objective.moves, []
+    for number, assembly in enumerate(objective.scene):
+        points = assembly.implant.points.double()
+        steps = int(0.5 * float((points.amax(0) - points.amin(0)).norm()) / _STEP_MM)
+        shifts = _STEP_MM * torch.arange(-steps, steps + 1, dtype=torch.float64, device=found.device)
+        along = found + shifts[:, None] * moves.shift(number, assembly.implant.principal_axes()[1][2])
+        losses = objective.losses(along)
+        padded = torch.nn.functional.pad(losses[None], (1, 1), value=torch.inf)[0]
+        minimum = (losses < padded[:-2]) & (losses <= padded[2:]) & (losses <= _WORSE * losses.min())
+        minimum[steps - 1 : steps + 2] = False  # that is where it is
+        order = losses.argsort()
+        others += [along[i] for i in order.tolist() if minimum[i]][: _MOST - 1]
+    start = torch.zeros_like(found)
+    if _distance(moves, found, start) > 3 * _STEP_MM:
+        others.append(start)
+    return [found, *others]
+
+
+def _distance(moves: Moves, one: Tensor, other: Tensor) -> float:
+    """Root mean square distance of the implants' nodes, mm."""
+    moved = moves.displacements(torch.stack([one, other]))
+    return float((moved[0] - moved[1]).norm())
 
 
 def find(run: StageRun) -> None:

@@ -3,25 +3,135 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
+
+from tqdm import tqdm
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import OPTIMIZERS, Progress
+from torchkcreg.progress import progress_bar
 from torchkcreg.scene import RegistrationData, Scene
+from torchkcreg.similarity import GradientCorrelation
 
 from .config import PHYSICS, RegistrationConfig, Stage
-from .finish import finished
+from .diagnosis import diagnose
+from .estimated_background import facing_data
 from .guard import Guard
-from .prepared import facing_data
+from .registered_implant import RegisteredImplant
 from .result import RegistrationResult
-from .stage_run import StageRun, Step, Terms
+from .stage import StageRun, Step, Terms, coarse, similarities
 from .steps import AFTER, BEFORE, CHANGE_SCENE
-from .verdict import Rival
+from .verdict import Rival, judge
 
 log = logging.getLogger(__name__)
+
+
+def finished(
+    scene: Scene,
+    data: RegistrationData,
+    config: RegistrationConfig,
+    terms: Terms,
+    last: Stage,
+    *,
+    history: Sequence[dict[str, Any]],
+    records: Sequence[dict[str, Any]],
+    undone: dict[str, str],
+    rival: Rival | None,
+    stopped: str | None,
+) -> RegistrationResult:
+    """The result of a registration whose scene is at its end."""
+    run = StageRun(scene, data, last, config, terms=terms)
+    run.with_background()
+    gc = similarities(run, GradientCorrelation)  # in which every pixel counts alike
+    probe = _diagnosed(run, data)
+    converged = _converged(history, last) and stopped is None
+    found, deviations = diagnose(probe.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
+    status, reasons = judge(found)
+    if stopped is not None:
+        reasons = [*reasons, f"the registration was ended before its time: {stopped}"]
+        status = "doubtful" if status == "ok" else status
+    return RegistrationResult(
+        implants=[
+            RegisteredImplant.of(assembly, has_material=config.material is not None, deviations=own)
+            for assembly, own in zip(scene, deviations, strict=True)
+        ],
+        gc=gc,
+        history=list(history),
+        stages=list(records),
+        config=config,
+        seed=config.seed,
+        status=status,
+        warnings=reasons,
+        diagnostics=asdict(found),
+        intensity={name: float(value.detach()) for name, value in scene.intensity.named_parameters()},
+        blur_mm=_blur_mm(scene, data),
+        view_motions=None if scene.view_motions is None else scene.view_motions.matrices(),
+        scene=scene,
+    )
+
+
+def _blur_mm(scene: Scene, data: RegistrationData) -> float:
+    """The intensity model's blur on the detector."""
+    blur = scene.intensity.free.get("blur")
+    sigma_px = 0.0 if blur is None else float(getattr(scene.intensity, blur.attribute).detach())
+    return sigma_px * math.sqrt(data.geometry.pixel_spacing[0] * data.geometry.pixel_spacing[1])
+
+
+def _diagnosed(run: StageRun, data: RegistrationData) -> StageRun:
+    """The last stage on pixels that are coarse enough to be quick, weighted as it was."""
+    probe = coarse(replace(run, data=data))
+    if "reweight" in run.stage.before:
+        probe.objective = probe.objective.reweighted()
+    return probe
+
+
+def _converged(history: Sequence[dict[str, Any]], last: Stage) -> bool:
+    ended = history[-1] if history else {"iteration": 0, "step_mm": 0.0}
+    return ended["iteration"] < last.iterations or ended["step_mm"] < 10 * last.tolerance
+
+
+class TrainerState(Protocol):
+    """What callbacks may look at, and do, while a registration runs."""
+
+    scene: Scene
+    stages: tuple[Stage, ...]
+    history: list[dict[str, Any]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """A checkpoint from which a run resumes bit by bit."""
+
+    def stop(self, reason: str) -> None:
+        """Ends the registration after the present iteration."""
+
+
+class ProgressBar(Callback):
+    """A tqdm bar a stage, with the loss and the last step."""
+
+    def __init__(self, disable: bool | None = None) -> None:
+        self.disable = disable  # None: only on a terminal
+        self._bar: tqdm | None = None
+
+    def on_stage_start(self, run: TrainerState, index: int, stage: Stage) -> None:
+        """Opens the stage's bar."""
+        groups = "1 group" if stage.groups == 1 else f"{stage.groups} groups"
+        name = f"stage {index + 1}/{len(run.stages)}: {groups}, {stage.optimizer}"
+        shown = None if self.disable is None else not self.disable
+        self._bar = progress_bar(total=stage.iterations, desc=name, shown=shown)
+
+    def on_iteration(self, run: TrainerState, index: int, progress: Progress) -> None:
+        """Moves the bar on."""
+        if self._bar is not None:
+            self._bar.set_postfix(loss=f"{progress.loss:.5f}", step_mm=f"{progress.step_mm:.4f}", refresh=False)
+            self._bar.update(progress.iteration - self._bar.n)
+
+    def on_stage_end(self, run: TrainerState, index: int, stage: Stage) -> None:
+        """Closes the bar."""
+        if self._bar is not None:
+            self._bar.close()
 
 
 @dataclass(frozen=True)

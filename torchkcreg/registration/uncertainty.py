@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import principal_axes
-from torchkcreg.parameters import ParameterBlocks
+from torchkcreg.optimization.parameters import ParameterBlocks
 
 _BLOCK_MM = 12.0  # on the detector: residuals of bone edges, beads and scatter hang together over about that much
 _SEEN = 1e-3  # of the largest curvature: directions that images tell something about

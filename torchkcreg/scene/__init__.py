@@ -1,21 +1,19 @@
 """What is in the beam and what is seen of it: implants with their poses, deformations and components (`Assembly`), the
-scene they make, which renders itself, the measured images, and all that may be changed to make both agree."""
+scene they make, which renders itself, the measured images, and all that may be changed to make both agree.
+"""
 
 from .assembly import Assembly, followed_motion
 from .background import with_background
 from .data import RegistrationData
-from .known_component import KnownComponent
-from .moves import Moves
+from .moves import Moves, ScrewPaths
 from .saved import scene_from_dict, scene_to_dict
 from .scene import Scene
-from .screw_paths import ScrewPaths
 from .state import Placement, State
 from .view import View
 from .view_motions import ViewMotions, ViewMotionSteps
 
 __all__ = [
     "Assembly",
-    "KnownComponent",
     "Moves",
     "Placement",
     "RegistrationData",

@@ -8,23 +8,86 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import Level, combined
-from torchkcreg.parameters import ParameterBlock, ParameterBlocks
+from torchkcreg.deformation import Level, Motion, combined
+from torchkcreg.geometry import fit_rigid, rotation_about, transform_points
+from torchkcreg.implant import Screw
+from torchkcreg.optimization.parameters import ParameterBlock, ParameterBlocks
 
 from .assembly import Assembly
-from .bound_motion import BoundMotion
-from .physics import PhysicsParameters
+from .parameter_blocks import ComponentTilts, PhysicsParameters, ScrewShapes
 from .scene import Scene
-from .screw_paths import ScrewPaths
-from .screw_shapes import ScrewShapes
-from .state import State
-from .tilts import ComponentTilts
+from .state import Placement, State
 from .view import View
 from .view_motions import ViewMotionSteps
 
+_PITCH_MM = 0.5
 _DIFFERENCE_MM = 1e-3
 _NODES_PITCH_MM = 2.0  # distances between candidates need no finer nodes
 _DEVIATIONS_PITCH_MM = 3.0
+
+
+class BoundMotion:
+    """Placements of an assembly as a function of the steps of its motion.
+
+    Args:
+        assembly: In its present state.
+        motion: Of its deformation from there.
+        nodes: The implant's nodes (N, 3) that are rendered.
+    """
+
+    def __init__(self, assembly: Assembly, motion: Motion, nodes: Tensor) -> None:
+        self.motion, self.pose = motion, assembly.implant_to_world.clone()
+        self.turns = rotation_about(assembly.heads, assembly.tilts)
+        self.nodes = self._bound(nodes.double(), nodes.dtype)
+        self.at_rest = assembly.followed
+        self.followed = self._bound(assembly.followed.flatten(0, 1), torch.float64) if len(assembly.followed) else None
+
+    def _bound(self, points: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """World positions (N, 3) of points at rest, and their features (N, F)."""
+        return transform_points(self.pose, points).to(dtype), self.motion.features(points).to(dtype)
+
+    def __call__(self, steps: Tensor, component_motions: Tensor | None = None) -> Placement:
+        """Placements of steps (K, D).
+
+        Args:
+            steps: Of the motion.
+            component_motions: Motions (K, C, 4, 4) of the components in the implant's frame beside following it; those
+                that they have now when None.
+        """
+        coefficients = self.motion.coefficients(steps) @ self.pose[:3, :3].T
+        turns = self.turns if component_motions is None else component_motions
+        components = self.pose.new_zeros(len(steps), 0, 4, 4)
+        if self.followed is not None:
+            moved = _moved(self.followed, coefficients).unflatten(1, self.at_rest.shape[:2])
+            components = fit_rigid(self.at_rest, moved) @ turns
+        return Placement(_moved(self.nodes, coefficients), components)
+
+
+def _moved(bound: tuple[Tensor, Tensor], coefficients: Tensor) -> Tensor:
+    """World positions (K, N, 3) for coefficients (K, F, 3) in the world's axes."""
+    world, features = bound
+    return world + combined(features, coefficients.to(features))
+
+
+class ScrewPaths:
+    """Path lengths (V, rows, cols) in mm of screws where an assembly, as it is, would have them.
+
+    Args:
+        assembly: It must not move meanwhile.
+        view: Of it.
+    """
+
+    def __init__(self, assembly: Assembly, view: View) -> None:
+        self.assembly, self.view = assembly, view
+        self._motions: dict[tuple[float, float, float], Tensor] = {}
+
+    @torch.no_grad()
+    def __call__(self, screw: Screw) -> Tensor:
+        """Of a screw, given in the implant's frame."""
+        pose = self.assembly.implant_to_world
+        if screw.start not in self._motions:
+            self._motions[screw.start] = pose @ self.assembly.motion_at(pose.new_tensor(screw.start))
+        return self.view.cloud_path_lengths(screw.stretched_cloud(_PITCH_MM), self._motions[screw.start])
 
 
 class Moves(ParameterBlocks):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, rigid_matrix, rotation_about
-from torchkcreg.parameters import ParameterBlock
+from torchkcreg.optimization.parameters import ParameterBlock
 from torchkcreg.precision import ExactModule
 
 _BESIDE_IMAGES = 30.0  # of the loss that a standard deviation of the images is worth

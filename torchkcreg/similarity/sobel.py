@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from kornia.filters import spatial_gradient
 from torch import Tensor
 
-from torchkcreg.differentiable import linear
+from torchkcreg.kernels.differentiable import linear
 from torchkcreg.precision import full_precision
 
 # Adjoint kernels, (gradient image of u and v) -> image. Both Sobel kernels are odd: turned by 180 degrees, as an
@@ -62,7 +62,7 @@ def erode_mask(mask: Tensor) -> Tensor:
 
 
 def _sobel(images: Tensor) -> Tensor:
-    """kornia's Sobel filter: (B, 1, rows, cols) -> (B, 2, rows, cols)."""
+    """Kornia's Sobel filter: (B, 1, rows, cols) -> (B, 2, rows, cols)."""
     return spatial_gradient(images, mode="sobel", order=1, normalized=True).squeeze(1)
 
 

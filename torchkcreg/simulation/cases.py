@@ -14,11 +14,12 @@ from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid
 from torchkcreg.implant import Screw
 from torchkcreg.mechanics import CarriedLoad
 from torchkcreg.physics import Spectrum, tungsten_spectrum
-from torchkcreg.simulation.hardware import hole_positions, locking_plate, locking_screws, mapped
-from torchkcreg.simulation.loads import Load
-from torchkcreg.simulation.parts import Part
-from torchkcreg.simulation.scanner import DetectorModel, simulate_projections
-from torchkcreg.simulation.solids import Cylinder, Sphere, Tube
+
+from .hardware import hole_positions, locking_plate, locking_screws, mapped
+from .loads import Load
+from .parts import Part
+from .scanner import DetectorModel, simulate_projections
+from .solids import Cylinder, Sphere, Tube
 
 AXIAL_SCREW_HOLES = (0, 1, 3, 6, 8, 9)
 S_BEND_SCREW_HOLES = (0, 1, 8, 9)

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from torchkcreg.simulation.hardware import hole_positions
-from torchkcreg.simulation.scanner import DetectorModel
+from .hardware import hole_positions
+from .scanner import DetectorModel
 
 _KILOVOLTS = (70, 80, 90, 100, 110, 120)
 

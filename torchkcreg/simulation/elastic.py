@@ -14,9 +14,10 @@ from torchkcreg.deformation import FiniteElementDeformation
 from torchkcreg.geometry import fit_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud, find_holes
 from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
-from torchkcreg.mechanics.rigid import rigid_fields
+from torchkcreg.mechanics.holds import rigid_fields
 from torchkcreg.physics import elastic_constants
-from torchkcreg.simulation.loads import RodMotion
+
+from .loads import RodMotion
 
 _PITCH_MM = 0.3
 _SCREW_SHEAR = 2e3  # N/mm, of a screw in its bone, by which its hold yields

@@ -11,7 +11,8 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.implant import Screw
-from torchkcreg.simulation.outline import plate_outline
+
+from .outline import plate_outline
 
 
 def locking_plate(

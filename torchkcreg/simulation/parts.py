@@ -10,8 +10,8 @@ import trimesh
 from torch import Tensor
 
 from torchkcreg.projector.mesh import project_mesh
-from torchkcreg.simulation.chords import chord_image
-from torchkcreg.simulation.solids import Solid
+
+from .solids import Solid, chord_image
 
 
 @dataclass(frozen=True, eq=False)

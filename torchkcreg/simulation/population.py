@@ -14,14 +14,15 @@ from torch import Tensor
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid, rigid_matrix
 from torchkcreg.implant import Screw
 from torchkcreg.physics import tungsten_spectrum
-from torchkcreg.simulation.cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase, fragment_at
-from torchkcreg.simulation.draws import Draw, draw_case
-from torchkcreg.simulation.elastic import ElasticMotion, Fragments, elastic_motion
-from torchkcreg.simulation.hardware import flared, locking_plate, mapped
-from torchkcreg.simulation.loads import Load, RodMotion
-from torchkcreg.simulation.parts import Part
-from torchkcreg.simulation.scanner import simulate_projections
-from torchkcreg.simulation.solids import Cylinder, Sphere, Tube
+
+from .cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase, fragment_at
+from .draws import Draw, draw_case
+from .elastic import ElasticMotion, Fragments, elastic_motion
+from .hardware import flared, locking_plate, mapped
+from .loads import Load, RodMotion
+from .parts import Part
+from .scanner import simulate_projections
+from .solids import Cylinder, Sphere, Tube
 
 PlateMotion = RodMotion | ElasticMotion
 ViewSet = Literal["neighbours", "around", "both", "spread", "many"]

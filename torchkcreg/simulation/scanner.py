@@ -12,7 +12,8 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.physics import Beam, Spectrum, gaussian_blur, material
 from torchkcreg.physics.blur import convolve, gaussian_kernel
-from torchkcreg.simulation.parts import Part, material_paths
+
+from .parts import Part, material_paths
 
 SCATTER_BLOCK = 8  # scatter is smooth: it is computed on blocks of this many pixels squared
 

@@ -1,10 +1,10 @@
 """Control points on a lattice around an implant, and the cubic B-spline field between them. Displacements of control
-points are in the grid's axes, points and fields in the implant's frame."""
+points are in the grid's axes, points and fields in the implant's frame.
+"""
 
-from torchkcreg.splines.basis import SplineBasis
-from torchkcreg.splines.bspline import cubic_bspline_derivatives, cubic_bspline_weights
-from torchkcreg.splines.displacement import cell_features, group_rigid_motions, spline_displacement
-from torchkcreg.splines.grid import ControlPointGrid, default_grid
+from .basis import SplineBasis, cubic_bspline_derivatives, cubic_bspline_weights
+from .displacement import cell_features, group_rigid_motions, spline_displacement
+from .grid import ControlPointGrid, default_grid
 
 __all__ = [
     "ControlPointGrid",

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import fit_rigid
-from torchkcreg.splines.basis import SplineBasis
-from torchkcreg.splines.grid import ControlPointGrid
+
+from .basis import SplineBasis
+from .grid import ControlPointGrid
 
 
 def spline_displacement(

@@ -1,8 +1,19 @@
 """Studies of many registrations on simulated cases: one runner that keeps what is finished, tables and figures."""
 
-from .simulated import simulated
-from .studies import STUDIES, Study, StudyOptions, run_study
+from .capture import CaptureStudy, CaptureTrial, capture_study
+from .catalogue import STUDIES, Study, StudyOptions, run_study
+from .simulated import simulated, wrong_geometry
 from .sweeps import sweep
-from .wrong_geometry import wrong_geometry
 
-__all__ = ["STUDIES", "Study", "StudyOptions", "run_study", "simulated", "sweep", "wrong_geometry"]
+__all__ = [
+    "STUDIES",
+    "CaptureStudy",
+    "CaptureTrial",
+    "Study",
+    "StudyOptions",
+    "capture_study",
+    "run_study",
+    "simulated",
+    "sweep",
+    "wrong_geometry",
+]

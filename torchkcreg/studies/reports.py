@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from torchkcreg.console import markdown_table
 from torchkcreg.io import write_figure
+from torchkcreg.io.tables import write_rows
 from torchkcreg.visualization.studies import (
     coverage_figure,
     errors_figure,
@@ -149,12 +149,3 @@ def of_views(rows: Sequence[Row], folder: Path) -> str:
         f"{best:.3f} against {others:.3f} mm (median); "
         f"correlation of log expected and log found error {correlation:.2f}"
     )
-
-
-def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Nothing; writes rows as CSV, a column a key."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)

@@ -14,19 +14,72 @@ from torch import Tensor
 
 from torchkcreg.deformation import Deformation, FiniteElementDeformation
 from torchkcreg.evaluation import bb_rmse
-from torchkcreg.experiments.capture import registration_inputs
-from torchkcreg.geometry import fit_rigid, transform_points
+from torchkcreg.geometry import ConeBeamGeometry, fit_rigid, transform_points
 from torchkcreg.implant import find_holes
+from torchkcreg.io.arrays import read_array, write_array
 from torchkcreg.mechanics import CarriedLoad
 from torchkcreg.physics import line_integrals_from_intensity
 from torchkcreg.registration import RegisteredImplant, RegistrationConfig, RegistrationData, register
+from torchkcreg.scene import ViewMotions
 from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case
 
+from .capture import registration_inputs
 from .sweeps import Job, Row
-from .wrong_geometry import wrong_geometry
 
+ERRORS = {"detector": 0.3, "source": 0.2, "limb": 0.3}  # pixels, mm, mm
 WIDTHS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.96, 2.25, 2.5, 2.75, 3.0, 3.5, 4.0)
 MOMENTS = ("true", "found", "std")
+
+
+def wrong_geometry(geometry: ConeBeamGeometry, nodes: Tensor, error: str, seed: int) -> ConeBeamGeometry:
+    """The geometry that a registration is told where the scan was made with another.
+
+    Errors are independent in each view and sum to nothing over all: what views have in common moves the implant, which
+    no image tells from a scanner that stands elsewhere.
+
+    Args:
+        geometry: Of the images.
+        nodes: World positions (N, 3) of the implant.
+        error: "detector": 0.3 pixels along rows and columns; "source": 0.2 mm along each axis; "limb": a rigid motion
+            between views that moves nodes by 0.3 mm, root mean square; "all" of them; "none".
+        seed: Of the random numbers.
+
+    Raises:
+        ValueError: If there is no such error.
+    """
+    if error not in ("none", "all", *ERRORS):
+        raise ValueError(f"error must be one of none, {', '.join(ERRORS)}, all, got {error!r}")
+    rng = np.random.default_rng([seed, 77])
+    number = geometry.num_views
+    drawn = [torch.from_numpy(rng.normal(size=(number, n))) for n in (2, 3, 6)]
+    pixels, shifts, motions = (x - x.mean(0) for x in drawn)
+    matrices = geometry.projection_matrices.clone()
+    if error in ("detector", "all"):
+        matrices[:, :2] += ERRORS["detector"] * pixels[..., None] * matrices[:, 2:]
+    if error in ("source", "all"):
+        distances = geometry.detector_distances.tolist()
+        moved = zip(matrices, distances, ERRORS["source"] * shifts, strict=True)
+        matrices = torch.stack([with_source(*view) for view in moved])
+    if error in ("limb", "all"):
+        limb = ViewMotions(nodes, number, 1.0)
+        limb.values.copy_(ERRORS["limb"] / math.sqrt(5) * motions)  # about its long axis a plate hardly moves
+        matrices = matrices @ limb.matrices()
+    return ConeBeamGeometry(
+        matrices,
+        geometry.det_shape,
+        geometry.pixel_spacing,
+        sources=geometry.sources,
+        angles_deg=geometry.angles_deg,
+    )
+
+
+def with_source(matrix: Tensor, distance: float, shift: Tensor) -> Tensor:
+    """The projection matrix (3, 4) after its source has moved by (3,) mm while the detector, so far off, stays."""
+    inverse = torch.linalg.inv(matrix[:, :3])
+    source = shift - inverse @ matrix[:, 3]
+    inverse[:, 2] -= shift / distance
+    rotated = torch.linalg.inv(inverse)
+    return torch.cat([rotated, -(rotated @ source)[:, None]], dim=1)
 
 
 def simulated(job: Job) -> Row:
@@ -87,11 +140,10 @@ def registered(job: Job, draw: Draw, case: SimulatedCase, *, chosen: list[int] |
 def made_case(draw: Draw, views: Any, elastic: bool, cache: str) -> SimulatedCase:
     """The case, its images out of a folder that keeps them, if there is one."""
     kept = Path(cache) / f"{'elastic-' if elastic else ''}{views}-{draw.seed}.npy" if cache else None
-    counts = torch.from_numpy(np.load(kept)) if kept is not None and kept.exists() else None
+    counts = read_array(kept) if kept is not None and kept.exists() else None
     case = random_case(draw, views=views, elastic=elastic, counts=counts)
     if kept is not None and counts is None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        np.save(kept, case.intensity.numpy())
+        write_array(kept, case.intensity)
     return case
 
 

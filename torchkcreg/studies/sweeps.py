@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from torchkcreg.io.files import append_line, read_text, write_text
 from torchkcreg.plain import plain
 from torchkcreg.progress import progress_bar
 
@@ -49,14 +50,11 @@ def sweep(
     """
     kept, version = read_table(table), importlib.metadata.version("torchkcreg")
     left = [job for key, job in {_key(job): job for job in jobs}.items() if "error" in kept.get(key, {"error": ""})]
-    table.parent.mkdir(parents=True, exist_ok=True)
-    with table.open("a", encoding="utf-8") as file:
-        rows = _made(function, left, workers, cluster)
-        for job, row in progress_bar(rows, total=len(left), desc=table.stem, shown=True):
-            kept[_key(job)] = plain(row)
-            file.write(json.dumps({"job": job, "row": plain(row), "version": version}) + "\n")
-            file.flush()
-            on_row(row)
+    rows = _made(function, left, workers, cluster)
+    for job, row in progress_bar(rows, total=len(left), desc=table.stem, shown=True):
+        kept[_key(job)] = plain(row)
+        append_line(table, json.dumps({"job": job, "row": plain(row), "version": version}))
+        on_row(row)
     return [kept[_key(job)] for job in jobs]
 
 
@@ -66,12 +64,12 @@ def read_table(table: Path) -> dict[str, Row]:
     Raises:
         ValueError: If another line is malformed.
     """
-    lines = table.read_text(encoding="utf-8").splitlines() if table.exists() else []
+    lines = read_text(table, "table").splitlines() if table.exists() else []
     found, versions = {}, set[str]()
     for number, line in enumerate(lines, start=1):
         entry = _entry(line)
         if entry is None and number == len(lines):
-            table.write_text("".join(f"{kept}\n" for kept in lines[:-1]), encoding="utf-8")
+            write_text(table, "".join(f"{kept}\n" for kept in lines[:-1]))
         elif entry is None:
             raise ValueError(f"table {table}, line {number} is no job with its row: {line[:80]}")
         else:

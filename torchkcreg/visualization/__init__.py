@@ -3,11 +3,9 @@
 Each function returns a matplotlib `Figure` of its own; nothing touches pyplot's state or a screen.
 """
 
-from .beam import beam_figure
-from .capture import capture_figure
 from .case import case_figure
 from .comparison import comparison_figure
-from .displacement import displacement_figure
+from .displacement_map import displacement_figure, series_figure
 from .errors import error_map_figure, histogram_figure
 from .geometry import geometry_figure
 from .history import history_figure
@@ -15,8 +13,9 @@ from .load import load_figure
 from .overlay import overlay_figure, overlay_layers
 from .page import Page, Row, page_html, png_of
 from .plan import plan_figure
-from .reconstruction import reconstruction_figure
-from .series import series_figure
+from .reconstruction import beam_figure, reconstruction_figure
+from .registration import draw_registration, draw_start, registered_layers
+from .studies import capture_figure
 
 __all__ = [
     "Page",
@@ -26,6 +25,8 @@ __all__ = [
     "case_figure",
     "comparison_figure",
     "displacement_figure",
+    "draw_registration",
+    "draw_start",
     "error_map_figure",
     "geometry_figure",
     "histogram_figure",
@@ -37,5 +38,6 @@ __all__ = [
     "plan_figure",
     "png_of",
     "reconstruction_figure",
+    "registered_layers",
     "series_figure",
 ]

@@ -11,7 +11,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from .displacement import _HEIGHT_IN, _draw, _limits, _projection, _upright
+from .displacement_map import _HEIGHT_IN, _draw, _limits, _projection, _upright
 from .style import AMBER, BLUE, GREEN, new_figure, open_frame
 
 _VIEWS = (("front", 0.0, 0.0), ("back", 180.0, 0.0), ("edge", 90.0, 0.0), ("oblique", 40.0, 25.0))

@@ -15,7 +15,7 @@
 namespace torchkcreg {
 
 constexpr int64_t kChunk = 2048;
-constexpr double kMinDepth = 1e-3;  // mm, as in projector/reference.py
+constexpr double kMinDepth = 1e-3;  // mm, as in projector/point_reference.py
 
 struct TableShape {
   int64_t phases;  // R

@@ -4,8 +4,7 @@ from .dicom import is_dicom, read_dicom_geometry
 from .images import image_header, read_image
 from .measured import Projections
 from .plausible import implausible_magnification
-from .projection_file import ProjectionFile
-from .projections import read_projections, write_projections, write_stack
+from .projections import ProjectionFile, read_projections, write_projections, write_stack
 
 __all__ = [
     "ProjectionFile",

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, DetectorFrames
-from torchkcreg.io.scans.order import by_number
+
+from .series import by_number
 
 DICOM_SUFFIXES = (".dcm", ".ima")
 NEEDED = "DICOM files need pydicom: pip install 'torchkcreg[io]'"

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchkcreg.io.scans.images import can_hold
-from torchkcreg.io.scans.series import ImageSeries
+from .images import can_hold
+from .series import ImageSeries
 
 HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs")
 _PROJECTION, _FLAT, _DARK = 0, 1, 2  # of NXtomo's image_key

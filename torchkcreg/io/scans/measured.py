@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
-from torchkcreg.io.scans.plausible import ImageHeader, stuck_pixels
 from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
+
+from .plausible import ImageHeader, stuck_pixels
 
 RELATIVE_FLOOR = 1e-6
 MOSTLY = 0.5  # of the pixels an open beam must light

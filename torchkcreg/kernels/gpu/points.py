@@ -136,7 +136,7 @@ def _gather(
 def point_drr(
     points: Tensor, volumes: Tensor, matrices: Tensor, table: Tensor, block_size: int, rows: int, cols: int
 ) -> Tensor:
-    """Images (B, V, rows, cols); see `torchkcreg.projector.reference.splat_points`."""
+    """Images (B, V, rows, cols); see `torchkcreg.projector.point_reference.splat_points`."""
     points, volumes, matrices, table = (t.contiguous() for t in (points, volumes, matrices, table))
     candidates, nodes, views = len(points), points.shape[1], len(matrices)
     images = points.new_zeros(candidates, views, rows, cols)

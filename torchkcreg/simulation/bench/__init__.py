@@ -4,11 +4,11 @@ Nothing that makes the images is the registration's: path lengths are exact chor
 from kernels that depend on what they pass, blur from focal spot and scintillator, and bones are bodies.
 """
 
-from torchkcreg.simulation.bench.acquisition import Acquisition, acquisitions, panel_of, views_of
-from torchkcreg.simulation.bench.loaded import ElasticConstruct, Loaded, loaded
-from torchkcreg.simulation.bench.panel import FlatPanel, scatter_shapes, scattered
-from torchkcreg.simulation.bench.recipe import LoadRecipe, Recipe
-from torchkcreg.simulation.bench.specimen import Specimen, recipe_files, recipe_in, specimen
+from .acquisition import Acquisition, acquisitions, panel_of, views_of
+from .loaded import ElasticConstruct, Loaded, loaded
+from .panel import FlatPanel, scatter_shapes, scattered
+from .recipe import LoadRecipe, Recipe
+from .specimen import Specimen, recipe_files, recipe_in, specimen
 
 __all__ = [
     "Acquisition",

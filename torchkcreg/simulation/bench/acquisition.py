@@ -12,12 +12,13 @@ from torch import Tensor
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
 from torchkcreg.physics import Beam, Spectrum, material
 from torchkcreg.progress import progress_bar
-from torchkcreg.simulation.bench.loaded import ElasticConstruct, Loaded, loaded
-from torchkcreg.simulation.bench.panel import FlatPanel, mean_ratio, scattered
-from torchkcreg.simulation.bench.recipe import Recipe, ScannerRecipe
-from torchkcreg.simulation.bench.specimen import Specimen
-from torchkcreg.simulation.bench.standing import parts_in_beam
 from torchkcreg.simulation.parts import Part, material_paths
+
+from .loaded import ElasticConstruct, Loaded, loaded
+from .panel import FlatPanel, mean_ratio, scattered
+from .recipe import Recipe, ScannerRecipe
+from .specimen import Specimen
+from .standing import parts_in_beam
 
 
 @dataclass(frozen=True, eq=False)

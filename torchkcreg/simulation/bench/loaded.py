@@ -16,11 +16,12 @@ from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
 from torchkcreg.physics import elastic_constants
-from torchkcreg.simulation.bench.recipe import LoadRecipe
-from torchkcreg.simulation.bench.specimen import DISTAL, PROXIMAL, Specimen
 from torchkcreg.simulation.elastic import hold_motions, rigid_at
 from torchkcreg.simulation.hardware import mapped
 from torchkcreg.simulation.loads import Load
+
+from .recipe import LoadRecipe
+from .specimen import DISTAL, PROXIMAL, Specimen
 
 _PITCH_MM = 0.4  # of the finite elements' nodes, or less: a tenth of the implant's thickness
 _NEAR_MM = 8.0  # of a screw's head: the implant there tells how it moves

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import Hole, Screw, find_holes
-from torchkcreg.simulation.bench.recipe import HeadRecipe, PlateShape, Recipe
 from torchkcreg.simulation.hardware import flared, locking_plate, mapped
 from torchkcreg.simulation.loads import RodMotion
+
+from .recipe import HeadRecipe, PlateShape, Recipe
 
 DISTAL, PROXIMAL = "distal", "proximal"
 

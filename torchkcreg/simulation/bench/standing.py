@@ -7,10 +7,11 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.simulation.bench.loaded import Loaded
-from torchkcreg.simulation.bench.specimen import DISTAL, PROXIMAL, Specimen
 from torchkcreg.simulation.parts import Part
 from torchkcreg.simulation.solids import Cylinder, Solid, Sphere, Tube
+
+from .loaded import Loaded
+from .specimen import DISTAL, PROXIMAL, Specimen
 
 _TISSUE = "tissue"
 _MARROW_GAP_MM = 1e-3

@@ -1,0 +1,173 @@
+"""How an implant and the fragments that it holds moved between registrations, out of their run folders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchkcreg.evaluation import AXES, RelativeMotion, fragments_of, frame_changes, relative_motion
+from torchkcreg.geometry import transform_points
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.io import implant_of_run, mesh_of_run, read_mesh, write_figure, write_json, write_text
+from torchkcreg.plain import plain
+from torchkcreg.registration import RegisteredImplant
+from torchkcreg.visualization import comparison_figure
+
+from .report import write_report
+
+_PITCH_MM = 1.0
+_COLUMNS = tuple(
+    f"{what}_{axis.replace(' ', '_')}_{unit}"
+    for what, unit in (("rotation", "deg"), ("translation", "mm"))
+    for axis in AXES
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Motions of the upper fragment against the lower one, from an unloaded registration to loaded ones.
+
+    Attributes:
+        names: Of the loaded runs.
+        motions: In each.
+        loads: N; empty where nobody said.
+        compliance: By how much rotations (degrees) and translations (mm), (6,), grow with a newton; None without loads.
+        compliance_std: Standard deviations.
+        warnings: Why they may not be so.
+        folder: Where the files are.
+    """
+
+    names: tuple[str, ...]
+    motions: tuple[RelativeMotion, ...]
+    loads: tuple[float, ...]
+    compliance: Tensor | None
+    compliance_std: Tensor | None
+    warnings: tuple[str, ...]
+    folder: Path
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types and tensors, with units in their names."""
+        runs = [{"run": name, **motion.to_dict()} for name, motion in zip(self.names, self.motions, strict=True)]
+        for run, load in zip(runs, self.loads):
+            run["load_n"] = load
+        content = {"runs": runs, "warnings": list(self.warnings)}
+        if self.compliance is not None and self.compliance_std is not None:
+            slopes = zip(_COLUMNS, self.compliance.tolist(), self.compliance_std.tolist(), strict=True)
+            content["compliance_per_n"] = {name: {"value": value, "std": std} for name, value, std in slopes}
+        return content
+
+    def table(self) -> str:
+        """A row a run, as CSV."""
+        heads = ["run", *(["load_n"] if self.loads else [])]
+        heads += [column for name in _COLUMNS for column in (name, "_std_".join(name.rsplit("_", 1)))]
+        lines = [",".join(heads)]
+        for number, (name, motion) in enumerate(zip(self.names, self.motions, strict=True)):
+            pairs = torch.stack(motion.numbers, dim=1).flatten().tolist()
+            load = [f"{self.loads[number]:g}"] if self.loads else []
+            lines.append(",".join([name, *load, *(f"{value:.5f}" for value in pairs)]))
+        return "\n".join(lines) + "\n"
+
+    def __str__(self) -> str:
+        parts = [f"{name}\n{motion}" for name, motion in zip(self.names, self.motions, strict=True)]
+        if self.compliance is not None and self.compliance_std is not None:
+            steepest = int(self.compliance[:3].abs().argmax())
+            slope, std = 1000 * float(self.compliance[steepest]), 1000 * float(self.compliance_std[steepest])
+            name = _COLUMNS[steepest].removesuffix("_deg").replace("_", " ")
+            parts.append(f"{name}: {slope:.3f} +- {std:.3f} degrees per kN")
+        return "\n".join([*parts, *(f"warning: {text}" for text in self.warnings), f"folder {self.folder}"])
+
+
+def compare_files(
+    unloaded: Path,
+    loaded: Sequence[Path],
+    out: Path,
+    *,
+    loads: Sequence[float] = (),
+    plane: Sequence[float] | None = None,
+    fragment: Path | None = None,
+    name: str | None = None,
+    figures: bool = True,
+) -> Comparison:
+    """Motion of a fracture's fragments from an unloaded registration to loaded ones; writes JSON, CSV and a figure.
+
+    Args:
+        unloaded: Run folder of the first registration.
+        loaded: Run folders of the others; their implants may lie in other CAD frames.
+        out: Folder for `compare.json`, `compare.csv` and `compare.png`; it is made.
+        loads: N, one a loaded run.
+        plane: Point, and perhaps normal, of the fracture in the first run's frame of the implant, 3 or 6 numbers.
+        fragment: Surface of one fragment in that frame.
+        name: Of several implants, which.
+        figures: Whether to draw.
+
+    Raises:
+        ValueError: If runs are of different implants, or fragments cannot be told.
+        FileNotFoundError: If a file is missing.
+    """
+    if not loaded:
+        raise ValueError("nothing to compare with: name a loaded run, or several")
+    if loads and len(loads) != len(loaded):
+        raise ValueError(f"{len(loaded)} loaded runs need as many loads, got {len(loads)}")
+    if plane is not None and len(plane) not in (3, 6):
+        raise ValueError(f"a plane is a point, or a point and a normal: 3 or 6 numbers, got {len(plane)}")
+    first, mesh, said = _implant(unloaded, name)
+    cloud = ImplantPointCloud.from_mesh(mesh, _PITCH_MM, dtype=torch.float64)
+    place = None
+    if plane is not None:
+        numbers = torch.tensor(list(plane), dtype=torch.float64)
+        place = numbers[:3], numbers[3:] if len(plane) == 6 else None
+    fragments = fragments_of(
+        cloud.points,
+        first.screws,
+        radius_mm=first.follow_radius_mm,
+        plane=place,
+        mesh=None if fragment is None else read_mesh(fragment),
+    )
+    warnings, motions = list(said), []
+    if not first.screws:
+        warnings.append("no screws tell what is fixed to which fragment: the ends of the implant stand for them")
+    for folder in loaded:
+        second, other, said = _implant(folder, name)
+        warnings += said
+        change = _nearest(frame_changes(mesh, other), first, second, cloud.points)
+        motions.append(relative_motion(first, second, cloud, fragments, to_second=change))
+    compliance, std = _slopes(motions, loads) if loads else (None, None)
+    names = tuple(str(folder) for folder in loaded)
+    found = Comparison(names, tuple(motions), tuple(loads), compliance, std, tuple(warnings), out)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "compare.json", plain(found.to_dict()))
+    write_text(out / "compare.csv", found.table())
+    if figures:
+        write_figure(out / "compare.png", comparison_figure(motions, [Path(n).name for n in names], loads))
+        write_report(out)
+    return found
+
+
+def _implant(folder: Path, name: str | None):
+    result, implant = implant_of_run(folder, name)
+    said = [f"{folder} is {result.status}: {why}" for why in result.warnings if result.status != "ok"]
+    if implant.deviations is None:
+        said.append(f"{folder} was written before registrations kept their deviations: there are no error bars")
+    return implant, read_mesh(mesh_of_run(folder, result.implants.index(implant))), said
+
+
+def _nearest(changes: Sequence[Tensor], first: RegisteredImplant, second: RegisteredImplant, points: Tensor) -> Tensor:
+    """Of several ways to lay a symmetric implant onto itself the one by which it has moved least."""
+    here = first.warp(points.double())
+    away = [float((second.warp(transform_points(c, points.double())) - here).square().mean()) for c in changes]
+    return changes[int(np.argmin(away))]
+
+
+def _slopes(motions: Sequence[RelativeMotion], loads: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Slopes (6,) over the load, through the origin, and their standard deviations."""
+    values, std = (torch.stack(parts) for parts in zip(*(motion.numbers for motion in motions), strict=True))
+    force = torch.tensor(list(loads), dtype=torch.float64)[:, None]
+    weights = 1 / std.square().clamp_min(1e-12)
+    scale = (weights * force**2).sum(0)
+    return (weights * force * values).sum(0) / scale, scale.rsqrt()

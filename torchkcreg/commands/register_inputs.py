@@ -1,0 +1,268 @@
+"""The input files of a registration, read and checked against each other."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from torchkcreg.geometry import transform_points
+from torchkcreg.implant import Component, ImplantPointCloud, find_holes
+from torchkcreg.io import (
+    implausible_magnification,
+    read_components,
+    read_geometry,
+    read_init,
+    read_mesh,
+    read_projections,
+    read_run,
+    read_spectrum,
+)
+from torchkcreg.kernels import choose_backend
+from torchkcreg.physics import Spectrum, material
+from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConfig
+from torchkcreg.scene import RegistrationData
+
+_FEWEST_NODES_ALONG = 4
+_SAME_FRAME_MM = 5.0  # by which bounds of one implant may differ: nodes do not reach its surface
+_FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
+
+
+@dataclass(frozen=True)
+class ImplantFiles:
+    """The files of one implant, see `torchkcreg.commands.RegistrationFiles`."""
+
+    name: str
+    mesh: Path
+    components: Path | None = None
+    init: Path | None = None
+    rest: Path | None = None
+    material: str | None = None
+
+
+def read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
+    """One implant of a registration.
+
+    Raises:
+        ValueError: If a file is malformed.
+        FileNotFoundError: If a file is missing.
+    """
+    screws = read_components(files.components) if files.components else []
+    mesh = read_mesh(files.mesh)
+    rest = _registered(files.rest, files, mesh) if files.rest else None
+    pose = _start_pose(files, mesh)
+    if files.init is None and rest is not None:
+        pose = rest.implant_to_world
+    _check_size(files.mesh, mesh, config.pitch_mm)
+    return Implant(
+        ImplantPointCloud.from_mesh(mesh, config.pitch_mm),
+        components=[Component.of(screw, pitch=config.pitch_mm) for screw in screws],
+        holes=find_holes(mesh),
+        implant_to_world=pose,
+        material=files.material,
+        name=files.name,
+        rest=rest,
+    )
+
+
+def _start_pose(files: ImplantFiles, mesh: trimesh.Trimesh) -> Tensor | None:
+    """A pose out of a file, or that of the same implant in the run folder of another registration."""
+    if files.init is None or not files.init.is_dir():
+        return read_init(files.init) if files.init else None
+    return _registered(files.init, files, mesh).implant_to_world
+
+
+def _registered(folder: Path, files: ImplantFiles, mesh: trimesh.Trimesh) -> RegisteredImplant:
+    """The same implant in the run folder of another registration."""
+    implants = read_run(folder).implants
+    implant = next((i for i in implants if i.name == files.name), implants[0])
+    if implant.deviations is not None:
+        nodes, bounds = implant.deviations.points, torch.from_numpy(np.array(mesh.bounds))
+        off = float((torch.stack([nodes.amin(0), nodes.amax(0)]) - bounds).abs().max())
+        if off > _SAME_FRAME_MM:
+            raise ValueError(
+                f"the implant of run folder {folder} reaches up to {off:.0f} mm further than {files.mesh}: another "
+                "implant, or another frame"
+            )
+    return implant
+
+
+def _check_size(path: Path, mesh: trimesh.Trimesh, pitch_mm: float) -> None:
+    if mesh.extents.max() < _FEWEST_NODES_ALONG * pitch_mm:
+        size = " x ".join(f"{extent:.3g}" for extent in mesh.extents)
+        raise ValueError(
+            f"the implant in {path} is {size} mm, too small for nodes {pitch_mm:g} mm apart: is the mesh in metres?"
+        )
+
+
+@dataclass(frozen=True)
+class RegistrationFiles:
+    """The files of a registration; of several implants, lists of as many entries, None where there is none.
+
+    Attributes:
+        implant: Closed mesh of the undeformed implant, mm.
+        geometry: Projection matrices.
+        projections: Intensities or line integrals.
+        spectrum: Detected spectrum; None takes a 90 kV tungsten spectrum where a material is named.
+        components: Screws that move with the implant.
+        init: Approximate pose, or the run folder of another registration of the implant.
+        rest: Run folder of a registration of the implant without load: finite elements bend it from that shape.
+        materials: Of each of several implants, where they are not of one.
+        views: Views to use; None takes all.
+        open_beam: Unattenuated intensity where the projections' file does not say it.
+        config: Options as YAML or JSON.
+    """
+
+    implant: Path | Sequence[Path]
+    geometry: Path
+    projections: Path
+    spectrum: Path | None = None
+    components: Path | Sequence[Path | None] | None = None
+    init: Path | Sequence[Path | None] | None = None
+    rest: Path | Sequence[Path | None] | None = None
+    materials: Sequence[str] | None = None
+    views: list[int] | None = None
+    open_beam: float | None = None
+    config: Path | None = None
+
+    def each(self) -> list[ImplantFiles]:
+        """The files of each implant.
+
+        Raises:
+            ValueError: If there are not as many of a kind as there are implants.
+        """
+        meshes = [self.implant] if isinstance(self.implant, Path) else list(self.implant)
+        names = [mesh.stem for mesh in meshes] if len(meshes) > 1 else ["implant"]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            times = names.count(twice[0])
+            raise ValueError(f"implants are named after their files, but {twice[0]} is there {times} times")
+        return [
+            ImplantFiles(*one)
+            for one in zip(
+                names,
+                meshes,
+                _for_each(self.components, len(meshes), "components"),
+                _for_each(self.init, len(meshes), "init"),
+                _for_each(self.rest, len(meshes), "rest"),
+                _for_each(self.materials, len(meshes), "material"),
+                strict=True,
+            )
+        ]
+
+
+def _for_each(given: Any, number: int, what: str) -> list[Any]:
+    listed = [given] if given is None or isinstance(given, (str, Path)) else list(given)
+    if given is None:
+        return [None] * number
+    if len(listed) != number:
+        raise ValueError(f"{number} implants need as many {what}, got {len(listed)}; - stands for none")
+    return listed
+
+
+@dataclass(frozen=True)
+class RegistrationInputs:
+    """What the files hold.
+
+    Attributes:
+        implants: Each undeformed implant with its components, holes and start pose.
+        data: Projections and geometry of the views to use.
+        spectrum: Detected spectrum, where one was given.
+        warnings: What a user should know about them, a line each.
+    """
+
+    implants: list[Implant]
+    data: RegistrationData
+    spectrum: Spectrum | None
+    warnings: list[str]
+
+    @property
+    def starts(self) -> list[Tensor]:
+        """Start pose (4, 4) of each implant."""
+        still = torch.eye(4, dtype=torch.float64)
+        return [still if i.implant_to_world is None else i.implant_to_world for i in self.implants]
+
+
+def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationInputs:
+    """The inputs of a registration; nothing is written.
+
+    Raises:
+        ValueError: If a file is malformed, files do not fit together, or an option cannot be had here.
+        FileNotFoundError: If a file is missing.
+    """
+    _check_options(files, config)
+    with _noted() as notes:
+        each = files.each()
+        data = _read_data(files, config)
+        spectrum = read_spectrum(files.spectrum) if files.spectrum else None
+        implants = [read_implant(one, config) for one in each]
+        for one in implants:
+            points, pose = one.cloud.points, one.implant_to_world
+            placed = points if pose is None else transform_points(pose, points.double())
+            if (doubt := implausible_magnification(data.facing(placed).geometry, placed)) is not None:
+                warnings.warn(doubt, stacklevel=2)
+    return RegistrationInputs(implants, data, spectrum, notes)
+
+
+def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None:
+    choose_backend(_device(config.device), config.backend)
+    if config.material is not None:
+        for name in (config.material, *(files.materials or ())):
+            material(name)
+    elif files.spectrum is not None:
+        raise ValueError("a spectrum needs the implant's material: name it with --material")
+    views = files.views or []
+    if twice := sorted({view for view in views if views.count(view) > 1}):
+        raise ValueError(f"views must be distinct, got view {twice[0]} {views.count(twice[0])} times")
+
+
+def _device(name: str) -> Tensor:
+    """An empty tensor on a device; ValueError where there is no such one."""
+    try:
+        return torch.empty(0, device=name)
+    except (RuntimeError, AssertionError, ValueError) as error:  # torch's own way to say so depends on the device
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"device {name!r} is not to be had: {reason[:120]}") from error
+
+
+def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationData:
+    geometry = read_geometry(files.geometry, projections=files.projections)
+    projections = read_projections(files.projections, open_beam=files.open_beam)
+    projections.check_against(geometry)
+    if files.views is not None:
+        projections = (
+            read_projections(files.projections, open_beam=files.open_beam, views=files.views)
+            if projections.num_masked  # counted anew, in these views alone
+            else projections.select(files.views)
+        )
+        geometry = geometry.select(files.views)
+    if (note := projections.masked_note()) is not None:
+        warnings.warn(f"projections file {files.projections}: {note}", stacklevel=2)
+    largest = max(stage.bin for stage in config.schedule())
+    if min(geometry.det_shape) < _FEWEST_PIXELS * largest:
+        rows, cols = geometry.det_shape
+        raise ValueError(f"the detector has {rows} x {cols} pixels, too few for a stage that bins {largest} into one")
+    return RegistrationData(geometry, projections.line_integrals, projections.mask)
+
+
+@contextmanager
+def _noted() -> Iterator[list[str]]:
+    """The texts of a block's warnings, a line each; at its end, be it an error, they are given once."""
+    notes: list[str] = []
+    caught: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield notes
+    finally:
+        texts = [" ".join(str(w.message).split()) for w in caught if issubclass(w.category, UserWarning)]
+        notes.extend(dict.fromkeys(texts))
+        for note in notes:
+            warnings.warn(note, stacklevel=4)

@@ -1,0 +1,41 @@
+"""Move points of a registered implant: from its own frame, before the motion, to the world."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from torch import Tensor
+
+from torchkcreg.io import read_points, read_run, write_points
+
+
+def warp_files(run_folder: Path, points_file: Path, out: Path, *, implant_name: str | None = None) -> Tensor:
+    """Write the points in the world, mm, with their expected errors; return which lie beyond the implant's reach (N,).
+
+    Args:
+        run_folder: Of a finished registration.
+        points_file: Table of x, y, z in the undeformed implant's frame, mm.
+        out: Table to write: x, y, z in the world, `outside`, and `lateral_std_mm` and `depth_std_mm` where known.
+        implant_name: Of several implants, the one whose frame the points are in.
+
+    Raises:
+        ValueError: If the run has no implant of that name, or a file cannot be read.
+    """
+    result, points = read_run(run_folder), read_points(points_file)
+    try:
+        implant = result.implant(implant_name)
+    except KeyError as error:
+        raise ValueError(f"run folder {run_folder}: {error.args[0]}") from None
+    outside = implant.outside(points)
+    if outside.any():
+        warnings.warn(
+            f"{int(outside.sum())} of {len(points)} points lie beyond the implant's reach: "
+            "they move rigidly with its nearest part",
+            stacklevel=1,
+        )
+    columns = {"outside": outside}
+    if implant.deviations is not None:
+        columns |= dict(zip(("lateral_std_mm", "depth_std_mm"), implant.deviations.split(points), strict=True))
+    write_points(out, implant.warp(points), **columns)
+    return outside

@@ -1,7 +1,0 @@
-"""The two experiments of Cao et al. 2020 (section 2.4), simulated: what is imaged, registered, compared and drawn."""
-
-from torchkcreg.experiments.paper.femoral import femoral_plate
-from torchkcreg.experiments.paper.steps import packaged
-from torchkcreg.experiments.paper.tibial import tibial_plate
-
-__all__ = ["femoral_plate", "packaged", "tibial_plate"]

@@ -1,0 +1,168 @@
+"""Point clouds with their fields, as `write_point_cloud_ply` writes them."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Mapping
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from .files import atomic_path, existing_file
+from .meshes import MESH_SUFFIXES, read_mesh
+from .tables import read_points
+
+CLOUD_SUFFIXES = (".csv", ".txt", ".xyz")
+_TRIANGLE = 5  # VTK's number of the cell type
+LONGEST_HEADER = 4096  # bytes
+
+
+def read_reference(path: str | os.PathLike[str]) -> trimesh.Trimesh | Tensor:
+    """A reference shape in mm: a closed surface, or points (N, 3) float64.
+
+    CSV, TXT and XYZ hold points, x, y, z a line. A PLY holds points if it has no faces, such as the
+    `implant_deformed.ply` of a run; the other formats of `read_mesh` are surfaces.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is of no known format, cannot be read, holds no points, or a point that is not finite; a surface
+            is open.
+    """
+    path = existing_file(path, "reference")
+    suffix = path.suffix.lower()
+    if suffix in CLOUD_SUFFIXES:
+        return read_points(path)
+    if suffix not in MESH_SUFFIXES:
+        raise ValueError(f"reference file {path} must be one of {', '.join((*MESH_SUFFIXES, *CLOUD_SUFFIXES))}")
+    if suffix == ".ply" and (points := _ply_points(path)) is not None:
+        return points
+    return read_mesh(path)
+
+
+def _ply_points(path: os.PathLike[str]) -> Tensor | None:
+    """The points of a PLY without faces; None where it has some."""
+    try:
+        content = trimesh.load(str(path), process=False)
+    except Exception as error:  # the parser fails in its own ways
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"reference file {path} cannot be read: {reason}") from error
+    vertices = getattr(content, "vertices", ())
+    if len(getattr(content, "faces", ())):
+        return None
+    if len(vertices) == 0:
+        raise ValueError(f"reference file {path} holds neither faces nor points")
+    points = torch.tensor(vertices, dtype=torch.float64)
+    if not bool(points.isfinite().all()):
+        row = int((~points.isfinite().all(-1)).nonzero()[0])
+        raise ValueError(f"reference file {path} must hold finite points, but number {row} is not")
+    return points
+
+
+def write_surface_vtu(path: str | os.PathLike[str], mesh: trimesh.Trimesh, values: Mapping[str, Tensor]) -> None:
+    """Nothing; writes a triangle mesh with values at its vertices as VTK XML.
+
+    Args:
+        path: The file, ending in .vtu.
+        mesh: V vertices, mm.
+        values: Name to values (V,) or vectors (V, 3).
+
+    Raises:
+        ValueError: A value does not belong to the vertices.
+    """
+    count = len(mesh.vertices)
+    for name, value in values.items():
+        if len(value) != count:
+            raise ValueError(f"{name} must have a value for each of {count} vertices, got {len(value)}")
+    root = ElementTree.Element("VTKFile", type="UnstructuredGrid", version="1.0", byte_order="LittleEndian")
+    grid = ElementTree.SubElement(root, "UnstructuredGrid")
+    piece = ElementTree.SubElement(grid, "Piece", NumberOfPoints=str(count), NumberOfCells=str(len(mesh.faces)))
+    data = ElementTree.SubElement(piece, "PointData")
+    for name, value in values.items():
+        _array(data, name, value.detach().cpu().double().numpy())
+    _array(ElementTree.SubElement(piece, "Points"), "Points", np.asarray(mesh.vertices))
+    cells = ElementTree.SubElement(piece, "Cells")
+    _array(cells, "connectivity", np.asarray(mesh.faces).ravel())
+    _array(cells, "offsets", 3 * np.arange(1, len(mesh.faces) + 1))
+    _array(cells, "types", np.full(len(mesh.faces), _TRIANGLE))
+    with atomic_path(path) as temporary:
+        ElementTree.ElementTree(root).write(temporary, xml_declaration=True, encoding="utf-8")
+
+
+def write_points_vtp(path: str | os.PathLike[str], points: Tensor, values: Mapping[str, Tensor]) -> None:
+    """Nothing; writes points with values as VTK XML, in single precision.
+
+    Args:
+        path: The file, ending in .vtp.
+        points: (N, 3), mm.
+        values: Name to values (N,) or vectors (N, 3).
+
+    Raises:
+        ValueError: A value does not belong to the points.
+    """
+    count = len(points)
+    for name, value in values.items():
+        if len(value) != count:
+            raise ValueError(f"{name} must have a value for each of {count} points, got {len(value)}")
+    sizes = {"type": "PolyData", "version": "1.0", "byte_order": "LittleEndian", "header_type": "UInt64"}
+    root = ElementTree.Element("VTKFile", sizes)
+    piece = ElementTree.SubElement(
+        ElementTree.SubElement(root, "PolyData"), "Piece", NumberOfPoints=str(count), NumberOfVerts=str(count)
+    )
+    data = ElementTree.SubElement(piece, "PointData")
+    for name, value in values.items():
+        _packed(data, name, value.detach().cpu().numpy().astype("<f4"))
+    _packed(ElementTree.SubElement(piece, "Points"), "Points", points.detach().cpu().numpy().astype("<f4"))
+    cells = ElementTree.SubElement(piece, "Verts")
+    _packed(cells, "connectivity", np.arange(count, dtype="<i8"))
+    _packed(cells, "offsets", np.arange(1, count + 1, dtype="<i8"))
+    with atomic_path(path) as temporary:
+        ElementTree.ElementTree(root).write(temporary, xml_declaration=True, encoding="utf-8")
+
+
+def _packed(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
+    """Numbers as they lie in memory, after their number of bytes, in base64."""
+    element = _array_element(parent, name, values, "Int64" if values.dtype.kind == "i" else "Float32", "binary")
+    size = np.array([values.nbytes], dtype="<u8")
+    element.text = base64.b64encode(size.tobytes() + np.ascontiguousarray(values).tobytes()).decode()
+
+
+def _array(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
+    whole = values.dtype.kind in "iu"
+    element = _array_element(parent, name, values, "Int64" if whole else "Float64", "ascii")
+    element.text = " ".join(str(x) for x in values.ravel()) if whole else " ".join(f"{x:.7g}" for x in values.ravel())
+
+
+def _array_element(
+    parent: ElementTree.Element, name: str, values: np.ndarray, kind: str, form: str
+) -> ElementTree.Element:
+    about = {"type": kind, "Name": name, "format": form}
+    if values.ndim == 2:
+        about["NumberOfComponents"] = str(values.shape[1])
+    return ElementTree.SubElement(parent, "DataArray", about)
+
+
+def read_point_cloud_ply(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """Columns (N,) of a binary PLY of this library by their names: x, y, z, and dx, dy, dz, displacement, std if there.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is another kind of PLY, or shorter than its header says.
+    """
+    content = existing_file(path, "point cloud").read_bytes()
+    end = content.find(b"end_header\n", 0, LONGEST_HEADER)
+    lines = content[:end].decode("ascii", errors="replace").splitlines()
+    if end < 0 or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
+        raise ValueError(f"point cloud file {path} is no binary PLY")
+    counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
+    names = [line.split()[-1] for line in lines if line.startswith("property float ")]
+    body = content[end + len(b"end_header\n") :]
+    if len(counts) != 1 or not counts[0].isdigit() or names[:3] != ["x", "y", "z"]:
+        raise ValueError(f"point cloud file {path} has no vertices of floats x, y, z")
+    if len(body) != int(counts[0]) * 4 * len(names):
+        raise ValueError(f"point cloud file {path} does not hold the {counts[0]} points that its header says")
+    table = np.frombuffer(body, dtype="<f4").reshape(-1, len(names))
+    return {name: torch.from_numpy(table[:, i].copy()) for i, name in enumerate(names)}

@@ -1,0 +1,7 @@
+"""The two experiments of Cao et al. 2020 (section 2.4), simulated: what is imaged, registered, compared and drawn."""
+
+from .experiment import packaged
+from .femoral import femoral_plate
+from .tibial import tibial_plate
+
+__all__ = ["femoral_plate", "packaged", "tibial_plate"]

@@ -1,0 +1,171 @@
+"""Steps of an experiment, each of which is kept in a folder of its own and not taken twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from torchkcreg.commands.reconstruct import reconstruct_files, resolve_options
+from torchkcreg.commands.reconstruct_options import ReconstructionFiles
+from torchkcreg.commands.register import register_files
+from torchkcreg.commands.register_inputs import RegistrationFiles
+from torchkcreg.commands.simulate import simulate_files
+from torchkcreg.evaluation import displacement_map
+from torchkcreg.geometry import MultisourceScanner, rigid_matrix
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.io import read_geometry, read_json, read_mesh, read_projections, read_run, write_figure, write_init
+from torchkcreg.projector import project_mesh
+from torchkcreg.registration import RegistrationResult
+from torchkcreg.simulation.bench import Recipe
+from torchkcreg.visualization import overlay_figure, series_figure
+
+_PITCH_MM = 0.8
+PAPER_SETTINGS = {"preset": "paper", "deformation": "ffd", "find_screws": False, "view_motion": "off"}
+_START_DEG, _START_MM = (0.8, -0.6, 1.0), (1.0, -1.2, 0.8)  # by which a registration's start is off
+
+
+def draw_series(out: Path, case: Path, results: Mapping[str, RegistrationResult], view: int) -> list[Path]:
+    """Figures 3A and 3B of Cao et al. 2020: ``overlay.png`` and ``displacement.png``.
+
+    Args:
+        out: Folder.
+        case: Of the images, `NAME.npz` for each result.
+        results: By the name of their configuration.
+        view: Number of the view over which the models are laid.
+    """
+    geometry, mesh = read_geometry(case / "geometry.json").select([view]), read_mesh(case / "implant.stl")
+    images, shadows, bent = [], [], {}
+    cloud = ImplantPointCloud.from_mesh(mesh, _PITCH_MM, dtype=torch.float64)
+    for name, result in results.items():
+        images.append(read_projections(case / f"{name}.npz", views=[view]).line_integrals[0])
+        deformed = result.deformed(mesh)
+        vertices, faces = (torch.from_numpy(np.array(a)) for a in (deformed.vertices, deformed.faces))
+        shadows.append(project_mesh(vertices, faces, geometry.projection_matrices, geometry.det_shape)[0].float())
+        bent[name] = displacement_map(cloud.points, result.warp(cloud.points), weights=cloud.volumes)
+    spacing = geometry.pixel_spacing
+    overlay = overlay_figure(
+        torch.stack(images), torch.stack(shadows), view_labels=list(results), pixel_spacing=spacing
+    )
+    write_figure(out / "overlay.png", overlay)
+    panels = {name: (one.undeformed, one.vectors) for name, one in bent.items()}
+    write_figure(out / "displacement.png", series_figure(panels, label="displacement against the distal end (mm)"))
+    return [out / "overlay.png", out / "displacement.png"]
+
+
+@dataclass(frozen=True)
+class ViewSets:
+    """The paper's sets of views, of which only these are imaged.
+
+    Attributes:
+        views: Numbers of the scan's views, by how many they are.
+    """
+
+    views: dict[int, list[int]]
+
+    @classmethod
+    def of_paper(cls, *, quick: bool) -> ViewSets:
+        """Three views and twelve; the three alone where it is to be quick."""
+        scanner = MultisourceScanner()
+        return cls({int(n): scanner.paper_views(n) for n in (("3",) if quick else ("3", "12"))})
+
+    @property
+    def imaged(self) -> list[int]:
+        """All of them, in the scan's order."""
+        return sorted({view for views in self.views.values() for view in views})
+
+    def places(self, number: int) -> list[int]:
+        """Places of the views of a set among those that are imaged."""
+        return [self.imaged.index(view) for view in self.views[number]]
+
+
+def packaged(name: str) -> dict[str, Any]:
+    """The recipe of an experiment, as its file has it."""
+    text = (resources.files("torchkcreg.studies.paper") / f"{name}.yaml").read_text(encoding="utf-8")
+    content: dict[str, Any] = yaml.safe_load(text)
+    return content
+
+
+def simulated(content: Mapping[str, Any], folder: Path, **changes: Any) -> Path:
+    """The case folder of a recipe with changes on top; what is there is kept."""
+    simulate_files(Recipe.of({**content, **changes}, "recipe"), folder)
+    return folder
+
+
+def start_of(folder: Path) -> Path:
+    """A file with a start pose that is off by one and a half millimetres and degrees."""
+    folder.mkdir(parents=True, exist_ok=True)
+    turn = torch.deg2rad(torch.tensor(_START_DEG, dtype=torch.float64, device="cpu"))
+    pose = rigid_matrix(turn, torch.tensor(_START_MM, dtype=torch.float64, device="cpu"))
+    write_init(folder / "start.json", pose)
+    return folder / "start.json"
+
+
+def registered(
+    case: Path,
+    configuration: str,
+    views: list[int],
+    run: Path,
+    *,
+    start: Path,
+    options: Mapping[str, Any],
+    known: bool = True,
+    implant: Path | None = None,
+) -> RegistrationResult:
+    """The registration of a configuration, in its run folder; one that was broken off goes on.
+
+    Args:
+        case: Folder of the simulated case.
+        configuration: Of it.
+        views: Of the case that are used.
+        run: Folder.
+        start: File of the start pose.
+        options: Of the registration.
+        known: Screws and spectrum are told.
+        implant: Another model of the undeformed implant than the case's.
+    """
+    if (run / "deformation.json").exists():
+        return read_run(run)
+    files = RegistrationFiles(
+        implant=implant or case / "implant.stl",
+        geometry=case / "geometry.json",
+        projections=case / f"{configuration}.npz",
+        spectrum=case / "spectrum.csv" if known else None,
+        components=case / "screws.json" if known else None,
+        init=start,
+        views=views,
+    )
+    return register_files(files, run, overrides=dict(options), resume=run.exists())
+
+
+def seconds_of(folder: Path) -> float:
+    """How long a run or a reconstruction took."""
+    return float(read_json(folder / "metrics.json", "metrics")["seconds"])
+
+
+def reconstructed(case: Path, configuration: str, out: Path, *, run: Path | None = None, **options: Any) -> Path:
+    """The volume of a configuration's scan; one that is there is kept."""
+    volume = out / "volume.mha"
+    if not (out / "metrics.json").exists():
+        files = ReconstructionFiles(
+            run=run,
+            geometry=case / "geometry.json",
+            projections=case / f"{configuration}.npz",
+            spectrum=case / "spectrum.csv",
+        )
+        reconstruct_files(files, out, resolve_options(options), resume=(out / "config.yaml").exists())
+    return volume
+
+
+def bench_model(implant: Mapping[str, Any], out: Path, *, size_mm: tuple[float, float, float]) -> Path:
+    """The volume of an undeformed implant's scan on a bench: FDK on voxels of 0.25 mm, the share of its metal."""
+    content = packaged("bench")
+    case = simulated({**content, "implant": dict(implant)}, out / "scan")
+    alone = {"method": "fdk", "single_material": implant["material"], "scatter": "none"}
+    return reconstructed(case, "bench", out / "fdk", spacing_mm=0.25, size_mm=size_mm, **alone)
