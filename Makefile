@@ -1,11 +1,11 @@
 # make setup | demo | test | test-full | docs | lint | format | clean        (make help says more)
 #
-# VENV     where the environment is made                    make test VENV=/tmp/kcreg
-# PYTHON   what makes it, Python 3.10 or later              make test PYTHON=python3.12
-# TORCH    which torch, 2.10 or later                       make test TORCH=torch==2.13.0
-# TORCH_PIP_FLAGS   where from: pip's --index-url of the build without CUDA, say
-# EXTRAS   what comes with the library                        make test EXTRAS=dev
-# JOBS     processes that test side by side                 make test JOBS=8
+# VENV     folder of the environment                        make test VENV=/tmp/kcreg
+# PYTHON   interpreter, Python 3.10 or later                make test PYTHON=python3.12
+# TORCH    version of torch, 2.10 or later                  make test TORCH=torch==2.13.0
+# TORCH_PIP_FLAGS   pip options for torch, e.g. --index-url of the build without CUDA
+# EXTRAS   extras to install                                  make test EXTRAS=dev
+# JOBS     number of parallel test processes                make test JOBS=8
 
 VENV ?= .venv
 PYTHON ?= python3
@@ -20,18 +20,19 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 SOURCES := $(wildcard torchkcreg/csrc/*.cpp torchkcreg/csrc/*.h torchkcreg/csrc/*/*.cpp torchkcreg/csrc/*/*.h)
 PYTEST := OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python -m pytest -n $(JOBS) --doctest-modules torchkcreg tests
 
-.PHONY: help setup demo test test-full docs lint format clean
+.PHONY: help setup demo test test-full docs lint results format clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make setup      an environment in $(VENV) with the library and what its development needs"
+	@echo "make setup      make an environment in $(VENV) with the library and its development tools"
 	@echo "make demo       simulate a loaded plate, register it, evaluate and draw the result, into demo/"
-	@echo "make test       quick tests and the examples in docstrings"
-	@echo "make test-full  the slow tests too, and those against RTK"
-	@echo "make docs       the documentation as a site, into site/; a broken link is an error"
-	@echo "make lint       ruff, mypy, clang-format; changes nothing"
-	@echo "make format     ruff and clang-format; changes files"
-	@echo "make clean      remove what building and testing leave (demo/ and the environment stay)"
+	@echo "make test       run the quick tests and the docstring examples"
+	@echo "make test-full  run all tests, including slow ones and those against RTK"
+	@echo "make docs       build the documentation site in site/; a broken link is an error"
+	@echo "make lint       check with ruff, mypy and clang-format; changes nothing"
+	@echo "make results    write the figures of benchmarks/results into README and documentation"
+	@echo "make format     format with ruff and clang-format"
+	@echo "make clean      remove build and test files (keeps demo/ and the environment)"
 
 setup: $(STAMP)
 
@@ -49,7 +50,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(PYTEST) -m "not slow"
 
-# All tests, those against RTK among them; one that is skipped is a failure, unless it asks for data or a device from elsewhere.
+# All tests, including those against RTK. A skipped test is a failure unless it needs external data or a device.
 test-full: $(STAMP)
 	$(PIP) --no-build-isolation --editable ".[$(EXTRAS),parity]"
 	$(PYTEST) --no-skips
@@ -62,11 +63,15 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy torchkcreg
 	$(BIN)/clang-format --dry-run --Werror $(SOURCES)
+	$(BIN)/python scripts/results.py --check
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(SOURCES)
+
+results: $(STAMP)
+	$(BIN)/python scripts/results.py
 
 clean:
 	rm -rf build dist torchkcreg.egg-info torchkcreg/*.so .pytest_cache .mypy_cache .ruff_cache .hypothesis

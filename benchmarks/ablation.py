@@ -1,10 +1,10 @@
-"""What each part of a registration is worth: BB and node errors on simulated plates, with one part left out at a time.
+"""Ablation study: BB and node errors on simulated plates, leaving out one part of the registration at a time.
 
-    python benchmarks/ablation.py            # every case, about 15 minutes on two cores
+    python benchmarks/ablation.py            # all cases, about 15 minutes on two cores
     python benchmarks/ablation.py --quick    # one case
 
-The cases are made by `torchkcreg.simulation`: a plate under axial load seen obliquely and face on, and a plate on four
-screws bent at every hole. The table goes to `benchmarks/results/ablation.md`.
+`torchkcreg.simulation` makes the cases: a plate under axial load, seen obliquely and face on, and a plate on four
+screws bent at every hole. The table is written to `benchmarks/results/ablation.md`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from common import write_report
 from tqdm import tqdm
 
 from torchkcreg.evaluation import bb_rmse
@@ -38,7 +39,7 @@ CASES = {
 
 @dataclass(frozen=True)
 class Variant:
-    """A registration with something left out."""
+    """A registration with one part left out."""
 
     name: str
     config: RegistrationConfig
@@ -48,16 +49,16 @@ class Variant:
 
 
 def variants() -> Iterator[Variant]:
-    """All of them, the whole first."""
+    """All variants, the full registration first."""
     default = RegistrationConfig(material="steel")
     stages = preset_stages("gauss-newton")
 
     def without(*names: str) -> RegistrationConfig:
-        left = [
+        stage_updates = [
             {field: tuple(x for x in getattr(s, field) if x not in names) for field in ("before", "estimate")}
             for s in stages
         ]
-        changed = tuple(s.model_copy(update=update) for s, update in zip(stages, left, strict=True))
+        changed = tuple(s.model_copy(update=update) for s, update in zip(stages, stage_updates, strict=True))
         return default.model_copy(update={"stages": changed})
 
     groups = (
@@ -99,9 +100,9 @@ def errors(case: SimulatedCase, variant: Variant) -> tuple[float, float, float]:
 
 
 def main() -> None:
-    """Writes the table."""
+    """Run all variants and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the first case alone")
+    parser.add_argument("--quick", action="store_true", help="run only the first case")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "ablation.md")
     options = parser.parse_args()
     names = list(CASES)[:1] if options.quick else list(CASES)
@@ -109,13 +110,13 @@ def main() -> None:
     heads = [f"{name}: BB / nodes (mm)" for name in names]
     lines = [f"| registration | {' | '.join(heads)} | s |", "| --- |" + " --- |" * (len(names) + 1)]
     for variant in tqdm(list(variants()), desc="variants"):
-        found = [errors(case, variant) for case in cases.values()]
-        cells = " | ".join(f"{bb:.3f} / {node:.3f}" for bb, node, _ in found)
-        lines.append(f"| {variant.name} | {cells} | {sum(f[2] for f in found) / len(found):.0f} |")
+        case_errors = [errors(case, variant) for case in cases.values()]
+        cells = " | ".join(f"{bb:.3f} / {node:.3f}" for bb, node, _ in case_errors)
+        lines.append(f"| {variant.name} | {cells} | {sum(f[2] for f in case_errors) / len(case_errors):.0f} |")
         tqdm.write(lines[-1])
-    how = f"Three views each; {torch.get_num_threads()} threads, torch {torch.__version__}."
+    setup = f"Three views each; {torch.get_num_threads()} threads, torch {torch.__version__}."
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text("\n".join([*lines, "", f"{how} Made by `python benchmarks/ablation.py`.", ""]))
+    write_report(options.out, "\n".join([*lines, "", f"{setup} Made by `python benchmarks/ablation.py`.", ""]))
 
 
 if __name__ == "__main__":

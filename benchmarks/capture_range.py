@@ -1,8 +1,8 @@
-"""How far off a registration may start: random starts on simulated data, as a table and a curve.
+"""Capture range: registrations from random starts on simulated data, as a table and a curve.
 
     python benchmarks/capture_range.py                        # 20 starts at each of 2, 5, 10, 15 mm and degrees
     python benchmarks/capture_range.py --starts 40 --offsets 10,20 --views 91,92,93
-    python benchmarks/capture_range.py --config my.yaml       # another start stage
+    python benchmarks/capture_range.py --config my.yaml       # with other options, e.g. another first stage
 
 Writes capture_range.md and capture_range.png to --out (default benchmarks/results). Exits with 1 if fewer than 95 % of
 the starts at 10 mm and 10 degrees end below 0.2 mm.
@@ -15,10 +15,10 @@ import sys
 from pathlib import Path
 
 import torch
+from common import write_report
 
 from torchkcreg.commands import resolve_config
 from torchkcreg.io import write_figure
-from torchkcreg.io.files import write_text
 from torchkcreg.studies import CaptureStudy, CaptureTrial, capture_study
 from torchkcreg.visualization import capture_figure
 
@@ -33,15 +33,15 @@ def main() -> int:
     studies = {f"views at {', '.join(map(str, views))} degrees": _study(options, views) for views in view_sets}
     text = "\n\n".join(f"{name}:\n\n{study.table()}" for name, study in studies.items())
     options.out.mkdir(parents=True, exist_ok=True)
-    write_text(options.out / "capture_range.md", f"# Capture range\n\n{_preamble(options)}\n\n{text}\n")
+    write_report(options.out / "capture_range.md", f"# Capture range\n\n{_preamble(options)}\n\n{text}\n")
     curves = {
         name: (study.offsets, [study.captured_share(o) for o in study.offsets]) for name, study in studies.items()
     }
     required = (REQUIRED_OFFSET, REQUIRED_SHARE)
     write_figure(options.out / "capture_range.png", capture_figure(curves, required=required))
     print(text)
-    asked = [study for study in studies.values() if REQUIRED_OFFSET in study.offsets]
-    return int(any(study.captured_share(REQUIRED_OFFSET) < REQUIRED_SHARE for study in asked))
+    required_studies = [study for study in studies.values() if REQUIRED_OFFSET in study.offsets]
+    return int(any(study.captured_share(REQUIRED_OFFSET) < REQUIRED_SHARE for study in required_studies))
 
 
 def _study(options: argparse.Namespace, views: tuple[int, ...]) -> CaptureStudy:
@@ -61,13 +61,13 @@ def _study(options: argparse.Namespace, views: tuple[int, ...]) -> CaptureStudy:
 
 
 def _preamble(options: argparse.Namespace) -> str:
-    told = "nothing of screws and spectrum" if options.unknown else "the screws and the spectrum"
+    knowledge = "without" if options.unknown else "with"
     return (
-        "A simulated ten-hole plate with screws and bone, moved but not bent. Each start is off by so many mm in a "
-        "random direction and, at once, so many degrees about a random axis through the plate's centre. Only the rigid "
-        f"stages run; the model is told {told}. *Captured*: the RMS distance of the plate's nodes from the truth "
-        "ends below 0.2 mm. *Right minimum*: it ends within 0.2 mm of where a start at the truth ends, which may be "
-        "biased."
+        "A simulated ten-hole plate with screws and bone, moved but not bent. Each start is off by the given number of "
+        "mm in a random direction and by as many degrees about a random axis through the plate's centre. Only the "
+        f"rigid stages run, {knowledge} known screws and spectrum. *Captured*: the final RMS distance of the plate's "
+        "nodes from the truth is below 0.2 mm. *Right minimum*: the final pose is within 0.2 mm (RMS) of the result of "
+        "a start at the truth, which may itself be biased."
     )
 
 
@@ -76,12 +76,14 @@ def _options() -> argparse.Namespace:
         return lambda text: tuple(kind(part) for part in text.split(","))
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--offsets", type=numbers(float), default=(2.0, 5.0, 10.0, 15.0), help="mm and degrees")
+    parser.add_argument(
+        "--offsets", type=numbers(float), default=(2.0, 5.0, 10.0, 15.0), help="start offsets, each in mm and degrees"
+    )
     parser.add_argument("--starts", type=int, default=20, help="random starts at each offset")
     parser.add_argument("--views", type=numbers(int), help="angles in degrees (default: 47,48,49 and 91,92,93)")
     parser.add_argument("--config", type=Path, help="options of the registration (YAML or JSON)")
-    parser.add_argument("--unknown", action="store_true", help="tell the model nothing of screws and spectrum")
-    parser.add_argument("--seed", type=int, default=0, help="of noise, starts and optimiser")
+    parser.add_argument("--unknown", action="store_true", help="register without knowing the screws and the spectrum")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of noise, starts and optimiser")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     return parser.parse_args()

@@ -1,7 +1,8 @@
-"""What the benchmarks share: the machine's name, which peers are there, rounds in turns."""
+"""Helpers for all benchmarks: name of the processor, installed peer libraries, timing in interleaved rounds."""
 
 from __future__ import annotations
 
+import csv
 import importlib.util
 import platform
 import time
@@ -13,6 +14,7 @@ _SLOW = 5.0
 
 
 def processor() -> str:
+    """Name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -21,6 +23,7 @@ def processor() -> str:
 
 
 def installed(module: str) -> bool:
+    """True if a module is installed. Does not import it."""
     try:
         return importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:
@@ -28,17 +31,18 @@ def installed(module: str) -> bool:
 
 
 def present(modules: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """Names of libraries whose modules are installed, and of those that are left out, with a word."""
+    """Names of the libraries that are installed and of those that are not; prints a line for each of the latter."""
     left_out = [name for name, module in modules.items() if not installed(module)]
     for name in left_out:
-        print(f"{name} is not installed and left out")
+        print(f"{name} is not installed and is left out")
     return [name for name in modules if name not in left_out], left_out
 
 
 def timed(steps: Mapping[Any, Callable[[], Any]], rounds: int) -> tuple[dict[Any, float], dict[Any, Any]]:
-    """Seconds of the best of some rounds, in which all steps take turns, after one to warm up; what that one gave.
+    """Best time of each step in seconds over some rounds after a warm-up, and the results of the warm-up.
 
-    What takes more than `_SLOW` seconds is called once alone: warming up is nothing against that.
+    In each round all steps run in turn. A step that takes more than `_SLOW` seconds runs only once, since the warm-up
+    hardly matters there.
     """
     best, results = {}, {}
     for key, run in steps.items():
@@ -53,3 +57,19 @@ def timed(steps: Mapping[Any, Callable[[], Any]], rounds: int) -> tuple[dict[Any
             run()
             best[key] = min(best[key], time.perf_counter() - start)
     return best, results
+
+
+def write_report(path: Path, text: str) -> None:
+    """Write a Markdown report, and each of its tables as CSV beside it: name.csv, name-2.csv, ..."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    tables: list[list[list[str]]] = [[]]
+    for line in [*text.splitlines(), ""]:
+        if line.startswith("|"):
+            tables[-1].append([cell.strip() for cell in line.strip("|").split("|")])
+        elif tables[-1]:
+            tables.append([])
+    for number, (header, _, *rows) in enumerate(tables[:-1], start=1):
+        name = path.stem if number == 1 else f"{path.stem}-{number}"
+        with path.with_name(f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([header, *rows])

@@ -1,4 +1,4 @@
-"""Calcium beside a titanium plate from one and from two tube voltages, on a simulated scan.
+"""Calcium near a titanium plate, measured with one and with two tube voltages in simulated scans.
 
     python benchmarks/dual_energy.py [--out benchmarks/results]
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 import trimesh
-from common import processor
+from common import processor, write_report
 
 from torchkcreg.evaluation import cylinder_region, distance_to, region_statistics
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
@@ -25,8 +25,8 @@ from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import reconstruction_figure
 
 ABOUT = """A bath of 68 mm with rods of 50, 100 and 200 mg/mL of calcium and a plate of 30 x 4 x 16 mm; 180 views of
-96 x 40 pixels of 1.2 mm, 70 and 120 kV in turns, 60 000 quanta. In the second scan the bath is lighter than water,
-which one voltage takes for a lack of calcium. "One attenuation" is KC-Rec of the same data."""
+96 x 40 pixels of 1.2 mm, alternating between 70 and 120 kV, 60 000 quanta. In the second scan the bath is lighter than
+water, which a single voltage mistakes for a lack of calcium. "One attenuation" is KC-Rec of the same data."""
 VIEWS = 180
 SPECTRA = {"low": tungsten_spectrum(70), "high": tungsten_spectrum(120)}
 GRID = VolumeGrid.centered((36, 64, 64), 1.2)
@@ -44,7 +44,7 @@ def plate() -> trimesh.Trimesh:
 
 
 def scan(bath: str) -> tuple[ConeBeamGeometry, torch.Tensor]:
-    """Views at two voltages in turns, and their transmissions."""
+    """Geometry of views with alternating tube voltage, and their transmission."""
     circle = circular_geometry(
         [i * 360 / VIEWS for i in range(VIEWS)], sad=404, sdd=538, det_shape=(40, 96), pixel_spacing=(1.2, 1.2)
     )
@@ -56,18 +56,19 @@ def scan(bath: str) -> tuple[ConeBeamGeometry, torch.Tensor]:
     return geometry, simulate_projections(geometry, parts, SPECTRA, detector=detector).float() / detector.open_beam
 
 
-def rows(bath: str, found: Decomposition, far: torch.Tensor) -> list[str]:
-    """Lines of the table: means and standard deviations in the rods and in the bath near the plate."""
+def rows(bath: str, decomposition: Decomposition, far: torch.Tensor) -> list[str]:
+    """Table rows: means and standard deviations in the rods and in the bath near the plate."""
     regions = {name: cylinder_region(GRID, (*at, -9.0), (*at, 9.0), 4.5) for name, at in RODS.items()}
     near = cylinder_region(GRID, (0, 0, -9), (0, 0, 9), 25.0) & (far > 2) & (far < 8)
     for at in RODS.values():
         near &= ~cylinder_region(GRID, (*at, -9.0), (*at, 9.0), 8.0)
     lines = []
     for name, region in {**regions, f"{bath} near the plate": near}.items():
-        two, one = (region_statistics(x, region) for x in (found.calcium_mg_ml, found.single_mg_ml))
-        density = region_statistics(found.water, region).mean
+        dual, single = (region_statistics(x, region) for x in (decomposition.calcium_mg_ml, decomposition.single_mg_ml))
+        density = region_statistics(decomposition.water, region).mean
         lines.append(
-            f"| {bath} | {name} | {two.mean:.1f} | {two.std:.1f} | {one.mean:.1f} | {one.std:.1f} | {density:.3f} |"
+            f"| {bath} | {name} | {dual.mean:.1f} | {dual.std:.1f} "
+            f"| {single.mean:.1f} | {single.std:.1f} | {density:.3f} |"
         )
     return lines
 
@@ -82,16 +83,19 @@ def main(arguments: list[str] | None = None) -> None:
     for bath in ("water", "adipose_tissue"):
         geometry, transmission = scan(bath)
         start = time.perf_counter()
-        found = decompose(transmission, geometry, GRID, SPECTRA, components=metal, progress=None)
+        decomposition = decompose(transmission, geometry, GRID, SPECTRA, components=metal, progress=None)
         seconds = time.perf_counter() - start
-        lines += rows(bath, found, far)
-        shown[f"{bath}: two voltages"], shown[f"{bath}: one attenuation"] = found.calcium_mg_ml, found.single_mg_ml
+        lines += rows(bath, decomposition, far)
+        shown[f"{bath}: two voltages"], shown[f"{bath}: one attenuation"] = (
+            decomposition.calcium_mg_ml,
+            decomposition.single_mg_ml,
+        )
     text = "\n".join(
         [
             "# Calcium from two tube voltages",
             "",
             ABOUT,
-            f"mg/mL, means and standard deviations. {seconds:.0f} s a scan; {processor()}.",
+            f"mg/mL, means and standard deviations. {seconds:.0f} s per scan; {processor()}.",
             "",
             "| bath | region | two voltages | std | one attenuation | std | water's density |",
             "| --- | --- | --- | --- | --- | --- | --- |",
@@ -101,7 +105,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "dual_energy.md").write_text(text)
+    write_report(options.out / "dual_energy.md", text)
     figure = reconstruction_figure(shown, GRID, heights_mm=(0.0,), window=(-150.0, 250.0), unit="mg/mL")
     figure.savefig(options.out / "dual_energy.png", dpi=120)
 

@@ -1,12 +1,13 @@
-"""The elastic body against quadratic tetrahedra (scikit-fem, on a mesh of Gmsh), on the ten-hole plate.
+"""Compare `ElasticBody` with quadratic tetrahedra (scikit-fem on a Gmsh mesh) on the ten-hole plate.
 
     pip install scikit-fem gmsh
-    python benchmarks/finite_elements.py        # a minute and a half
+    python benchmarks/finite_elements.py        # takes a minute and a half
 
-The same forces at the same holes bend both. Printed are, for each load: the difference of displacements, relative and
-both rigidly aligned; the bending or twisting moment that the superelement reads off the tetrahedra's displacements,
-against the applied one; the difference of von Mises stress at places more than three millimetres from any hole, against
-the largest there.
+Both models are loaded by the same forces at the same holes. For each load this prints
+* the relative difference of the displacements after rigid alignment,
+* the bending or twisting moment that the superelement estimates from the tetrahedra's displacements, compared with the
+  applied moment,
+* the difference of the von Mises stress more than 3 mm from any hole, relative to the largest stress there.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from torchkcreg.physics import elastic_constants
 from torchkcreg.simulation import locking_plate
 
 HOLES = (0, 2, 7, 9)
-LOADS = {  # at the four holes: component, values
+LOADS = {  # component of the load, its values at the four holes, component of the section load to compare
     "bending out of its plane": (1, (100.0, -100.0, -100.0, 100.0), 3),
     "bending in its plane": (0, (200.0, -200.0, -200.0, 200.0), 4),
     "torsion": (5, (-3000.0, 0.0, 0.0, 3000.0), 5),
@@ -44,7 +45,7 @@ AWAY_MM = 3.0
 
 
 def tetrahedra(mesh: trimesh.Trimesh, size: float) -> skfem.MeshTet:
-    """Tetrahedra inside a closed surface."""
+    """Tetrahedral mesh of the inside of a closed surface; `size` is the edge length in mm."""
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     with tempfile.TemporaryDirectory() as folder:
@@ -70,7 +71,7 @@ def tetrahedra(mesh: trimesh.Trimesh, size: float) -> skfem.MeshTet:
 
 
 class Tetrahedra:
-    """A free elastic body on quadratic tetrahedra."""
+    """A free elastic body meshed with quadratic tetrahedra."""
 
     def __init__(self, mesh: skfem.MeshTet, lame: tuple[float, float]) -> None:
         self.mesh, self.lame = mesh, lame
@@ -86,16 +87,19 @@ class Tetrahedra:
         self.matrix = stiffness.assemble(self.basis).tocsc()
 
     def solved(self, points: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        """Displacements under forces (P, 3) in balance at points (P, 3), three vertices pinned."""
-        right = self.values(points).T @ forces.T.ravel()
+        """Solution under balanced forces (P, 3) at points (P, 3). Three vertices are pinned against rigid motion."""
+        load_vector = self.values(points).T @ forces.T.ravel()
         low, high = (self.mesh.p[2].argmin(), self.mesh.p[2].argmax())
         side = np.abs(self.mesh.p[0] - self.mesh.p[0].max()).argmin()
         dofs = self.basis.nodal_dofs
         pinned = np.concatenate([dofs[:, low], dofs[:2, high], dofs[1:2, side]])
-        return skfem.solve(*skfem.condense(self.matrix, right, D=pinned), solver=lambda a, b: spsolve(a, b))
+        return skfem.solve(*skfem.condense(self.matrix, load_vector, D=pinned), solver=lambda a, b: spsolve(a, b))
 
     def values(self, points: np.ndarray):
-        """Matrix from degrees of freedom to displacements (3 P), component by component; of the nearest tetrahedron."""
+        """Matrix from the degrees of freedom to displacements (3 P,) at points, one component after the other.
+
+        A point outside the mesh uses its nearest tetrahedron.
+        """
         cells, number = self._cells(points), len(points)
         local = self.basis.mapping.invF(points.T[:, :, None], tind=cells)
         rows, cols, entries = [], [], []
@@ -117,11 +121,11 @@ class Tetrahedra:
         return near[np.arange(len(points)), least.argmax(1)]
 
     def displacement(self, points: np.ndarray, solution: np.ndarray) -> Tensor:
-        """At points (P, 3)."""
+        """Displacements (P, 3) at points (P, 3)."""
         return torch.from_numpy((self.values(points) @ solution).reshape(3, -1).T.copy())
 
     def stress(self, solution: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (E, 3) and stresses (E, 3, 3) in the middle of each tetrahedron."""
+        """Centres (E, 3) of the tetrahedra and the stresses (E, 3, 3) there."""
         middle = (np.full((3, 1), 0.25), np.ones(1))
         basis = skfem.Basis(self.mesh, self.basis.elem, quadrature=middle)
         gradient = basis.interpolate(solution).grad[..., 0]  # (3, 3, E)
@@ -132,14 +136,14 @@ class Tetrahedra:
 
 
 def aligned(points: Tensor, moved: Tensor) -> Tensor:
-    """Displacements (P, 3) without the rigid part."""
-    small = 1e-3  # so small that rotations add
+    """Displacements (P, 3) without their rigid part."""
+    small = 1e-3  # small enough for rotations to be linear
     changed = points + small * moved
     return (transform_points(torch.linalg.inv(fit_rigid(points, changed)), changed) - points) / small
 
 
 def main() -> None:
-    """Prints the table."""
+    """Run the comparison and print its results."""
     plate, constants = locking_plate(), elastic_constants("steel")
     holes = find_holes(plate)
     start = time.perf_counter()
@@ -150,37 +154,39 @@ def main() -> None:
     start = time.perf_counter()
     body = ElasticBody(cloud, constants)
     element = Superelement.of(cloud, constants, holds, negligible_mm=0.0)
-    print(f"{body.hexahedra.num_nodes * 3} of hexahedra, {time.perf_counter() - start:.1f} s, body twice")
-    where, forces = unit_loads(cloud, holds)
+    print(
+        f"hexahedra: {body.hexahedra.num_nodes * 3} degrees of freedom, {time.perf_counter() - start:.1f} s (2 bodies)"
+    )
+    load_points, forces = unit_loads(cloud, holds)
     inside = cloud.coarsened(4).points.double()
     for name, (component, values, moment) in LOADS.items():
         chosen = [6 * hole + component for hole in HOLES]
-        points = [where[c] for c in chosen]
+        points = [load_points[c] for c in chosen]
         pushed = [v * forces[c] for v, c in zip(values, chosen, strict=True)]
         nodal = sum(body.response([p], [f]) for p, f in zip(points, pushed, strict=True))
         start = time.perf_counter()
         solution = fine.solved(torch.cat(points).numpy(), torch.cat(pushed).numpy())
         seconds = time.perf_counter() - start
-        found = body.displacement(inside, nodal)[0], fine.displacement(inside.numpy(), solution)
-        ours, theirs = (aligned(inside, u) for u in found)
-        difference = float((ours - theirs).norm() / theirs.norm())
-        read = _read(element, inside, theirs)
+        displacements = body.displacement(inside, nodal)[0], fine.displacement(inside.numpy(), solution)
+        hexahedral, tetrahedral = (aligned(inside, u) for u in displacements)
+        difference = float((hexahedral - tetrahedral).norm() / tetrahedral.norm())
+        read = _read(element, inside, tetrahedral)
         middle = float(read.section_loads[len(read.heights) // 2, moment])
         true = values[-1] if component == 5 else values[0] * float(read.hold_heights[0] - read.hold_heights[HOLES[1]])
         places, stress = fine.stress(solution)
         far = _far_from_holes(places, holes)
-        vm = von_mises(torch.from_numpy(stress[far]))
-        own = von_mises(body.stress(torch.from_numpy(places[far]), nodal)[0])
-        off = (own - vm).abs() / vm.max()
+        tetrahedra_stress = von_mises(torch.from_numpy(stress[far]))
+        body_stress = von_mises(body.stress(torch.from_numpy(places[far]), nodal)[0])
+        stress_error = (body_stress - tetrahedra_stress).abs() / tetrahedra_stress.max()
         print(
-            f"{name}: displacement {difference:.2%}; moment read off {middle:.0f} of {true:.0f} N mm "
-            f"({abs(middle) / abs(true) - 1:+.2%}); stress 99 % within {float(off.quantile(0.99)):.1%}, "
-            f"largest {float(off.max()):.1%}, of {float(vm.max()):.0f} N/mm^2 ({seconds:.0f} s)"
+            f"{name}: displacement {difference:.2%}; estimated moment {middle:.0f} of {true:.0f} N mm "
+            f"({abs(middle) / abs(true) - 1:+.2%}); stress 99 % within {float(stress_error.quantile(0.99)):.1%}, "
+            f"largest {float(stress_error.max()):.1%}, of {float(tetrahedra_stress.max()):.0f} N/mm^2 ({seconds:.0f} s)"
         )
 
 
 def _read(element: Superelement, points: Tensor, moved: Tensor) -> CarriedLoad:
-    """What the superelement finds in displacements (P, 3) of points, the other holes being empty."""
+    """Load that the superelement estimates from displacements (P, 3) of points; only `HOLES` carry load."""
     shares = torch.full((len(element.holds),), 1e-3, dtype=torch.float64)
     shares[list(HOLES)] = 1.0
     expected = ExpectedLoads.of(element, shares)

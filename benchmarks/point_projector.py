@@ -1,13 +1,14 @@
-"""Time and accuracy of the point-cloud projector beside nanodrr and DiffDRR, in one run on one machine.
+"""Time and accuracy of the point-cloud projector compared with nanodrr and DiffDRR, on one machine.
 
     python benchmarks/point_projector.py [--threads 2] [--rounds 3] [--binning 2] [--out benchmarks/results]
 
-The ten-hole plate in the paper's three views. All render the same pixels. Nodes are drawn by a footprint that is
-made once, as in a registration; peers render voxels of the size of the nodes' lattice, each with its share of metal,
-by one ray a pixel, and nanodrr by several, too, that are averaged. Backwards, the images' gradient goes to every node
-here, and to the pose there, which is less. Errors are those of the exact chords, averaged over pixels. Then how the
-projector's time grows with nodes, views, candidates and threads. Peers that are not installed are left out with a word.
-Writes point_projector.md and point_projector.png.
+The ten-hole plate in the paper's three views; all libraries render the same pixels. torchkcreg renders nodes with a
+footprint that is computed once, as in a registration. The other libraries render voxels of the size of the nodes'
+lattice, each with its share of metal, with one ray per pixel; nanodrr is also run with the average of several rays.
+torchkcreg's backward pass gives the gradient with respect to every node; the others' only with respect to the pose,
+which is less work. Errors are relative to the exact chords, averaged over pixels. A second table shows how the
+projector's speed depends on the number of nodes, views, candidates and threads. Libraries that are not installed are
+left out with a message. Writes point_projector.md and point_projector.png.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from importlib import metadata
 from pathlib import Path
 
 import torch
-from common import present, processor, timed
+from common import present, processor, timed, write_report
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -29,10 +30,10 @@ from torchkcreg.projector import PointCloudProjector, cell_footprint, project_me
 from torchkcreg.simulation import locking_plate
 
 PITCH = 0.25
-RAYS_AT_ONCE = 4096  # of Siddon's method, which keeps every plane that a ray crosses
+RAYS_AT_ONCE = 4096  # for Siddon's method, which stores every plane that a ray crosses
 FINER = 3
 BANDS = 8
-SAMPLES = 200  # of a ray inside the volume: of nanodrr, and DiffDRR's trilinear renderer
+SAMPLES = 200  # per ray inside the volume, for nanodrr
 Steps = dict[str, Callable[[], Tensor]]
 
 
@@ -54,11 +55,11 @@ class Scene:
         self.upstream = torch.rand(self.truth.shape, generator=generator)
 
     def error(self, images: Tensor) -> float:
-        """Root mean square error over that of the truth, per cent."""
+        """Root mean square error relative to the root mean square of the truth, per cent."""
         return 100 * float((images.double() - self.truth).norm() / self.truth.norm())
 
     def voxels(self) -> tuple[Tensor, Tensor]:
-        """Share of metal (x, y, z) in the lattice's cells, and the affine matrix (4, 4) from their indices."""
+        """Share of metal (x, y, z) in the lattice's cells, and the affine matrix (4, 4) from cell indices to mm."""
         points = self.cloud.points.double()
         steps = self.cloud.cell.double().diagonal()
         index = ((points - points.amin(0)) / steps).round().long()
@@ -85,14 +86,14 @@ def mesh(scene: Scene) -> Steps:
 
 
 def rays(geometry: ConeBeamGeometry) -> tuple[Tensor, Tensor]:
-    """Sources (V, 1, 3) and points (V, N, 3) behind the object on the rays through all pixels."""
+    """Sources (V, 1, 3), and points (V, N, 3) behind the object on the rays through all pixels."""
     sources, directions = geometry.source_positions.float(), geometry.rays().flatten(1, 2).float()
     directions = directions / directions.norm(dim=-1, keepdim=True)
     return sources[:, None], sources[:, None] + 600 * directions
 
 
 def nanodrr(scene: Scene, finer: int = 1) -> Steps:
-    """Its camera is put at the world's origin: sources and ends of rays are given in the world."""
+    """The camera is at the world origin, so sources and ray ends are given in world coordinates."""
     from nanodrr.data import Subject
     from nanodrr.drr.renderer import render
 
@@ -111,7 +112,7 @@ def nanodrr(scene: Scene, finer: int = 1) -> Steps:
     sources, ends = rays(scene.geometry.refined(finer))
     pose = torch.eye(4)[None].requires_grad_(True)
     _, rows, cols = scene.truth.shape
-    size, nothing = finer * (rows // BANDS), torch.eye(3)[None]  # what a band keeps for its gradient fits in memory
+    size, nothing = finer * (rows // BANDS), torch.eye(3)[None]  # bands limit the memory for the gradient
 
     def band(view: int, number: int) -> Tensor:
         part = slice(number * size * cols * finer, (number + 1) * size * cols * finer)
@@ -150,16 +151,16 @@ def diffdrr(scene: Scene) -> Steps:
 
     def images() -> Tensor:
         parts = []
-        for some in ends.split(RAYS_AT_ONCE, dim=1):
-            length = (some - sources).norm(dim=-1)[:, None]
-            parts.append(renderer(volume, moved(sources), moved(some), length)[:, 0])
+        for chunk in ends.split(RAYS_AT_ONCE, dim=1):
+            length = (chunk - sources).norm(dim=-1)[:, None]
+            parts.append(renderer(volume, moved(sources), moved(chunk), length)[:, 0])
         return torch.cat(parts, dim=1).reshape(shape)
 
     return both(images, pose, scene.upstream)
 
 
 def both(images: Callable[[], Tensor], leaf: Tensor, upstream: Tensor) -> Steps:
-    """Forward alone, without autograd, and with the gradient to a leaf."""
+    """Forward pass alone, without autograd, and forward and backward pass to the gradient of a leaf."""
 
     def forward() -> Tensor:
         with torch.no_grad():
@@ -178,16 +179,16 @@ LIBRARIES = {
 
 
 def measure(scene: Scene, threads: int, rounds: int, names: list[str]) -> list[tuple[str, str, int, float, float]]:
-    """Rows (step, library, threads, best seconds, error in per cent)."""
+    """Table rows (step, library, threads, best seconds, error in per cent)."""
     torch.set_num_threads(threads)
     made = {name: LIBRARIES[name][0](scene) for name in names}
-    times, found = timed({(name, step): run for name, steps in made.items() for step, run in steps.items()}, rounds)
-    errors = {name: scene.error(found[name, "forward"]) for name in names}
+    times, images = timed({(name, step): run for name, steps in made.items() for step, run in steps.items()}, rounds)
+    errors = {name: scene.error(images[name, "forward"]) for name in names}
     return [(step, name, threads, seconds, errors[name]) for (name, step), seconds in times.items()]
 
 
 def growth(scene: Scene, rounds: int) -> list[tuple[str, int, float]]:
-    """Rows (what grows, how much there is, million node-views a second), forward."""
+    """Table rows (varied quantity, its value, million node-views per second) of the forward pass."""
     rows = []
     scanner, cloud = MultisourceScanner(), scene.cloud
 
@@ -214,17 +215,17 @@ def growth(scene: Scene, rounds: int) -> list[tuple[str, int, float]]:
 
 
 def roofline(scene: Scene, rate: float, rounds: int) -> str:
-    """What so many million node-views a second are of the floating-point rate that a matrix product reaches."""
+    """Compare a rate in million node-views per second with the floating-point rate of a matrix product."""
     geometry, cloud = scene.geometry, scene.cloud
     taps = cell_footprint(cloud.points, cloud.cell, geometry.projection_matrices).taps
-    operations = 2 * (4 * taps**2 + 12) + taps**2  # four corners of the table a tap; the projection; the image
+    operations = 2 * (4 * taps**2 + 12) + taps**2  # per tap, four corners of the table; the projection; the image
     size = 2048
     left, right = torch.rand(2, size, size)
     best = 2 * size**3 / timed({0: lambda: left @ right}, rounds)[0][0] / 1e9
-    found = rate * operations / 1e3
+    reached = rate * operations / 1e3
     return (
-        f"A node-view has {taps} x {taps} taps, {operations} floating-point operations: {found:.0f} GFLOP/s, "
-        f"{100 * found / best:.0f} % of the {best:.0f} GFLOP/s of a product of {size} x {size} matrices."
+        f"A node-view has {taps} x {taps} taps, {operations} floating-point operations: {reached:.0f} GFLOP/s, "
+        f"{100 * reached / best:.0f} % of the {best:.0f} GFLOP/s of a product of {size} x {size} matrices."
     )
 
 
@@ -236,8 +237,9 @@ def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: lis
     lines = [
         "# Point-cloud projector",
         "",
-        f"{len(scene.cloud.points)} nodes on a lattice of {PITCH} mm, 3 views of {shape}; best of some rounds, in "
-        f"turns. {processor()}; {', '.join(versions)}." + "".join(f" {name} is not installed." for name in left_out),
+        f"{len(scene.cloud.points)} nodes on a lattice of {PITCH} mm, 3 views of {shape}; best of some rounds, "
+        f"interleaved. {processor()}; {', '.join(versions)}."
+        + "".join(f" {name} is not installed." for name in left_out),
         "",
         "| step | library | threads | seconds | of torchkcreg's time | error, % |",
         "| --- | --- | --- | --- | --- | --- |",
@@ -247,8 +249,8 @@ def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: lis
         lines.append(f"| {step} | {name} | {threads} | {seconds:.4f} | {ratio:.1f} | {error:.2f} |")
     lines += [
         "",
-        f"Error: root mean square against the exact chords, averaged over pixels; nanodrr takes {SAMPLES} samples of a "
-        "ray inside the volume. Back: the gradient to all nodes, or vertices, here; to the poses there.",
+        f"Error: root mean square against the exact chords, averaged over pixels; nanodrr takes {SAMPLES} samples per "
+        "ray inside the volume. Back: gradient to all nodes or vertices (torchkcreg), to the poses (other libraries).",
         "",
         "| what grows | to | million node-views a second |",
         "| --- | --- | --- |",
@@ -303,7 +305,7 @@ def main(arguments: list[str] | None = None) -> None:
     text = table(scene, rows, grown, names, left_out, limit)
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "point_projector.md").write_text(text)
+    write_report(options.out / "point_projector.md", text)
     draw(rows, options.out / "point_projector.png")
 
 

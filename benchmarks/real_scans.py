@@ -1,11 +1,11 @@
-"""Scans that others measured: FDK against a vendor's slice, a limited-angle disc, a geometry calibrated from beads.
+"""Public measured scans: FDK against a vendor's slice, a limited-angle disc, a geometry calibrated from beads.
 
     python benchmarks/real_scans.py DATA [--out benchmarks/results]
 
-DATA holds, as their authors give them away: `axitom/` (radiogram and the vendor's slice, github.com/PolymerGuy/AXITOM),
+DATA holds the data sets as published: `axitom/` (radiogram and the vendor's slice, github.com/PolymerGuy/AXITOM),
 `htc2022/` (Helsinki tomography challenge 2022, github.com/TomographicImaging/CIL-HTC2022-Algo2) and `pellegrin_cbct/`
 (180 views of a printed cylinder with two beads, github.com/thmspllgr/CBCT-Reconstruction). Writes real_scans.md and
-one picture of each.
+one figure per data set.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Picture = dict[str, np.ndarray]
 
 
 def axitom(data: Path) -> tuple[str, Picture]:
-    """One radiogram of a specimen that is the same from all sides; the vendor took 3142."""
+    """FDK from one radiogram of an axially symmetric specimen; the vendor's slice used 3142 views."""
     image = np.load(data / "radiogram_bin4_f32.npz")["radiogram"]
     lines = -np.log(np.clip(image, 1e-3, None))
     profile = lines[20:180].mean(0)
@@ -45,24 +45,26 @@ def axitom(data: Path) -> tuple[str, Picture]:
     views = torch.from_numpy(lines).float().expand(geometry.num_views, *image.shape).contiguous()
     pitch = 4 * 0.013614837863123
     grid = VolumeGrid((499, 1, 100), pitch, (pitch / 2, 0.0, -249 * pitch))
-    ours = fdk(views, geometry, grid)[:, 0].flip(0).numpy()
+    slice_image = fdk(views, geometry, grid)[:, 0].flip(0).numpy()
     vendor = sitk.GetArrayFromImage(sitk.ReadImage(str(data / "recon_by_external_software.tif")))
-    theirs = vendor[:1996].astype(float).reshape(499, 4, 100, 4).mean((1, 3))
+    vendor_slice = vendor[:1996].astype(float).reshape(499, 4, 100, 4).mean((1, 3))
     inner = (slice(30, 470), slice(3, 95))  # without the cone's truncated ends and the rings on the axis
-    correlation = np.corrcoef(ours[inner].ravel(), theirs[inner].ravel())[0, 1]
-    slope, base = np.polyfit(theirs[inner].ravel(), ours[inner].ravel(), 1)
-    scaled = slope * theirs + base
-    off = np.sqrt(np.mean((ours - scaled)[inner] ** 2)) / np.ptp(np.percentile(ours[inner], [2, 98]))
-    text = (
-        f"FDK of one radiogram, seen from 180 sides, against the vendor's slice from 3142 views: correlation "
-        f"{correlation:.3f}, root mean square difference {100 * off:.1f} % of the range of grey values (the vendor's "
-        "brought to ours by a factor and an offset)."
+    correlation = np.corrcoef(slice_image[inner].ravel(), vendor_slice[inner].ravel())[0, 1]
+    slope, base = np.polyfit(vendor_slice[inner].ravel(), slice_image[inner].ravel(), 1)
+    scaled = slope * vendor_slice + base
+    relative_error = np.sqrt(np.mean((slice_image - scaled)[inner] ** 2)) / np.ptp(
+        np.percentile(slice_image[inner], [2, 98])
     )
-    return text, {"torchkcreg, one view": ours[inner].T, "vendor, 3142 views": scaled[inner].T}
+    text = (
+        f"FDK of one radiogram, repeated for 180 views, against the vendor's slice from 3142 views: correlation "
+        f"{correlation:.3f}, root mean square difference {100 * relative_error:.1f} % of the range of grey "
+        "values (the vendor's fitted to ours by a factor and an offset)."
+    )
+    return text, {"torchkcreg, one view": slice_image[inner].T, "vendor, 3142 views": scaled[inner].T}
 
 
 def htc2022(data: Path) -> tuple[str, Picture]:
-    """An acrylic disc with holes, from a part of the circle."""
+    """PWLS of an acrylic disc with holes, from a limited range of angles."""
     content = loadmat(data / "htc2022_ta_sparse_example.mat", struct_as_record=False, squeeze_me=True)["CtDataLimited"]
     lines = torch.from_numpy(content.sinogram).float()[:, None]
     angles = np.atleast_1d(content.parameters.angles)
@@ -74,31 +76,32 @@ def htc2022(data: Path) -> tuple[str, Picture]:
     residual = (system.project(volume, range(geometry.num_views)) - lines).abs().mean() / lines.max()
     text = (
         f"{len(angles)} views over {np.ptp(angles):.0f} degrees of an acrylic disc: PWLS explains the line integrals "
-        f"to {100 * residual:.1f} % of their largest; what the missing directions would tell stays open."
+        f"to {100 * residual:.1f} % of their maximum. Structures seen only in the missing views are "
+        "not recovered."
     )
-    return text, {"line integrals, views down": lines[:, 0].numpy(), "PWLS": volume[0].numpy()}
+    return text, {"line integrals, one row per view": lines[:, 0].numpy(), "PWLS": volume[0].numpy()}
 
 
 def pellegrin(data: Path) -> tuple[str, Picture]:
-    """A scanner made by hand, measured with a ruler; its rows run along the axis, which lies."""
+    """A home-made scanner, measured with a ruler; its axis is horizontal, along the detector rows."""
     counts = torch.from_numpy(np.load(data / "proj180_bin2_u16.npz")["proj"].astype(np.float32))
     lines = -(counts / counts[:, :, 2:10].median()).clamp_min(1e-3).log().transpose(1, 2).contiguous()
-    pixel, rows, found = 2 * 127 / 343, lines.shape[1], {}
+    pixel, rows, calibrations = 2 * 127 / 343, lines.shape[1], {}
     tracks = track_beads(lines, diameter_px=4.6)
     for sense in (1, -1):
-        told = circular_geometry(
+        nominal = circular_geometry(
             [sense * 2.0 * i for i in range(len(lines))],
             sad=308.7,
             sdd=308.7 + 149,
             det_shape=(rows, lines.shape[2]),
             pixel_spacing=(pixel, pixel),
         )
-        found[sense] = told, calibrate(told, tracks)
-    sense = min(found, key=lambda s: found[s][1].median_px)
-    told, calibration = found[sense]
+        calibrations[sense] = nominal, calibrate(nominal, tracks)
+    sense = min(calibrations, key=lambda s: calibrations[s][1].median_px)
+    nominal, calibration = calibrations[sense]
     grid = VolumeGrid.centered((150, 160, 160), 0.5)
     shown = {
-        "as measured by hand": fdk(lines, told, grid),
+        "as measured by hand": fdk(lines, nominal, grid),
         "calibrated from two beads": fdk(lines, calibration.geometry, grid),
     }
     contrasts = [
@@ -106,20 +109,20 @@ def pellegrin(data: Path) -> tuple[str, Picture]:
     ]
     moved = calibration.detector
     text = (
-        f"Two beads, followed through {len(lines)} views: {calibration.before_px:.2f} pixels (median) off in the "
-        f"geometry as told, {calibration.median_px:.2f} after calibration ({found[-sense][1].median_px:.2f} with "
-        f"angles in the other sense). The detector stands {moved['shift_u_mm']:.2f} mm aside "
-        f"(+/- {calibration.deviations['shift_u_mm']:.2f}) and is turned by {moved['turn_normal_deg']:.2f} degrees "
+        f"Two beads, tracked through {len(lines)} views: {calibration.before_px:.2f} pixels (median) off in the given "
+        f"geometry, {calibration.median_px:.2f} after calibration ({calibrations[-sense][1].median_px:.2f} with "
+        f"angles in the other sense). The detector is shifted by {moved['shift_u_mm']:.2f} mm "
+        f"(+/- {calibration.deviations['shift_u_mm']:.2f}) and rotated by {moved['turn_normal_deg']:.2f} degrees "
         f"(+/- {calibration.deviations['turn_normal_deg']:.2f}) in its plane. The beads' attenuation rises from "
-        f"{contrasts[0]} to {contrasts[1]} per mm. What is left is the beads': they lie loosely in their holders and "
-        "roll by two pixels as the cylinder turns about its axis, which lies."
+        f"{contrasts[0]} to {contrasts[1]} per mm. The remaining error comes from the beads: they lie loosely in "
+        "their holders and roll by two pixels as the cylinder turns about its horizontal axis."
     )
     height = int(((calibration.beads[0, 2] - grid.origin[2]) / 0.5).round())
     return text, {name: volume[height].numpy() for name, volume in shown.items()}
 
 
 def _peak(volume: torch.Tensor, grid: VolumeGrid, place: torch.Tensor) -> float:
-    """The mean of the 27 brightest voxels within 3 mm."""
+    """Mean of the 27 brightest voxels within 3 mm of a place."""
     near = volume[(grid.points() - place.float()).norm(dim=-1) < 3.0]
     return float(near.topk(27).values.mean())
 
@@ -130,7 +133,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    lines = ["# Scans that others measured", "", f"`python benchmarks/real_scans.py DATA`; {processor()}.", ""]
+    lines = ["# Public measured scans", "", f"`python benchmarks/real_scans.py DATA`; {processor()}.", ""]
     cases = {"axitom": axitom, "htc2022": htc2022, "pellegrin_cbct": pellegrin}
     for name, case in cases.items():
         text, images = case(options.data / name)

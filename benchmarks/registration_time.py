@@ -1,9 +1,9 @@
-"""How long a registration takes, and where the time goes, in one run on one machine.
+"""Time and memory of a registration, stage by stage.
 
     python benchmarks/registration_time.py [--rounds 3] [--threads 2] [--out benchmarks/results]
 
-The simulated weight-bearing case of the demo: three views and twelve, with screws and spectrum known and without. Each
-is registered in a process of its own, files to result, as `torchkcreg register` does; the best of some rounds counts.
+The simulated tibial plate in three views and in twelve, with and without known screws and spectrum. Each registration
+runs in a separate process, from files to result, as `torchkcreg register` does. The fastest of the rounds is reported.
 Peak memory is that of the process. Writes registration_time.md.
 """
 
@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 import torch
-from common import processor
+from common import processor, write_report
 
 CASES = {
     "3 views, known": {"views": "3", "known": True},
@@ -28,7 +28,7 @@ CASES = {
 
 
 def simulate(folder: Path) -> None:
-    """The tibial plate under 600 N in the paper's views."""
+    """Simulate the tibial plate under 600 N in the paper's views."""
     from torchkcreg.studies.paper.experiment import ViewSets, packaged, simulated, start_of
 
     content = packaged("tibial_plate")
@@ -38,7 +38,7 @@ def simulate(folder: Path) -> None:
 
 
 def register(folder: Path, out: Path, views: str, known: bool, threads: int) -> None:
-    """One registration in this process; prints what it took as JSON."""
+    """Run one registration in this process and print its times and peak memory as JSON."""
     started = time.perf_counter()
     from torchkcreg.commands.register import register_files
     from torchkcreg.commands.register_inputs import RegistrationFiles
@@ -56,17 +56,17 @@ def register(folder: Path, out: Path, views: str, known: bool, threads: int) -> 
         views=ViewSets.of_paper(quick=False).places(int(views)),
     )
     result = register_files(files, out, overrides={"material": "steel"})
-    taken = {
+    costs = {
         "import": imported,
         "whole": time.perf_counter() - started,
         "stages": list({record["stage"]: record["seconds"] for record in result.history}.values()),
         "gib": peak_gib(),
     }
-    print(json.dumps(taken))
+    print(json.dumps(costs))
 
 
 def peak_gib() -> float:
-    """Of this process since it was started; `getrusage` would count what it was forked from."""
+    """Peak memory of this process in GiB. `getrusage` would include the process that it was forked from."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 2**20
 
@@ -76,7 +76,7 @@ def table(rows: dict[str, list[dict]], threads: int) -> str:
     lines = [
         "# Registration",
         "",
-        f"The tibial plate under 600 N, files to result and figures; best of {len(next(iter(rows.values())))}. "
+        f"The tibial plate under 600 N, from files to result and figures; best of {len(next(iter(rows.values())))}. "
         f"{processor()}, {threads} threads; torch {torch.__version__}.",
         "",
         "| registration | seconds | of that imports | stages | peak memory, GiB |",
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> None:
     text = table(rows, options.threads)
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "registration_time.md").write_text(text)
+    write_report(options.out / "registration_time.md", text)
 
 
 if __name__ == "__main__":

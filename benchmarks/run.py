@@ -1,10 +1,11 @@
-"""All benchmarks that compare with peers, in one run on one machine: tables and plots in a folder.
+"""Run all benchmarks that compare with other libraries, on one machine, and write tables and plots to a folder.
 
     python benchmarks/run.py [--quick] [--out benchmarks/results]
 
-The point-cloud projector beside nanodrr and DiffDRR, the voxel projector beside itk-rtk and mbirtorch, and how long a
-registration takes, stage by stage. Peers come with `pip install nanodrr diffdrr itk-rtk mbirtorch`; those that are not
-there are left out with a word. `--quick`: one round, small images.
+Compares the point-cloud projector with nanodrr and DiffDRR, and the voxel projector with itk-rtk and mbirtorch, and
+measures the time of a registration, stage by stage. Install the other libraries with
+`pip install nanodrr diffdrr itk-rtk mbirtorch`; those not installed are left out with a message. `--quick`: one round,
+small images.
 """
 
 from __future__ import annotations

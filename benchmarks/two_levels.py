@@ -1,8 +1,8 @@
-"""Small voxels around a plate against small ones, or large ones, everywhere: error, noise, time and memory.
+"""Two-level grid (small voxels near a plate) against small or large voxels everywhere: error, noise, time, memory.
 
     python benchmarks/two_levels.py [--out benchmarks/results]
 
-Writes two_levels.md and two_levels.png. Each grid runs in a process of its own, for its memory.
+Writes two_levels.md and two_levels.png. Each grid runs in a separate process, to measure its memory.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 import trimesh
-from common import processor
+from common import processor, write_report
 
 from torchkcreg.evaluation import cylinder_region, distance_to, region_statistics
 from torchkcreg.geometry import TwoLevelGrid, VolumeGrid, circular_geometry
@@ -26,12 +26,12 @@ from torchkcreg.simulation import DetectorModel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import reconstruction_figure
 
-ABOUT = """KC-Rec of a bath of 46 mm with a titanium plate of 20 x 3.4 x 12 mm and wires of calcium (300 mg/mL, 0.8 and
-1.6 mm thick) 1.5 to 4 mm beside it; 200 views of 160 x 48 pixels of 0.5 mm, 90 kV, 60 000 quanta, two passes of 12
-iterations, roughness of the same strength per mm. Voxels of 0.8 mm, of 0.267 mm, and of 0.267 mm within 6 mm of the
-plate with 0.8 mm elsewhere. Within 5 mm of the metal, sampled every 0.267 mm, in 1e-5/mm (water is 2000 or so): the
-root mean square of the error of everything, and in water 1.2 mm and more from the wires the error of the mean and the
-standard deviation. Contrast is the share of a wire's own that is found in it."""
+ABOUT = """KC-Rec of a water bath of 46 mm with a titanium plate of 20 x 3.4 x 12 mm and calcium wires (300 mg/mL,
+0.8 and 1.6 mm thick) 1.5 to 4 mm beside it; 200 views of 160 x 48 pixels of 0.5 mm, 90 kV, 60 000 quanta, two passes of
+12 iterations, roughness penalty of the same strength per mm. Voxels of 0.8 mm, of 0.267 mm, and of 0.267 mm within 6 mm
+of the plate with 0.8 mm elsewhere. Evaluated within 5 mm of the metal, sampled every 0.267 mm, in 1e-5/mm (water is
+about 2000): the root mean square error of all voxels, and in water at least 1.2 mm from the wires the error of the mean
+and the standard deviation. Contrast is the reconstructed contrast of a wire, relative to its true contrast."""
 GEOMETRY = circular_geometry(
     [i * 1.8 for i in range(200)], sad=404, sdd=538, det_shape=(48, 160), pixel_spacing=(0.5, 0.5)
 )
@@ -60,7 +60,7 @@ def parts() -> list[Part]:
 
 
 def solved(name: str, beta: float) -> tuple[torch.Tensor, VolumeGrid, float, float]:
-    """The volume near the plate on the fine grid or the coarse one, seconds, and the process's memory in GiB."""
+    """Reconstructed volume, its grid (of a two-level grid, the fine one), seconds, and peak memory in GiB."""
     detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16)
     transmission = simulate_projections(GEOMETRY, parts(), SPECTRUM, detector=detector).float() / detector.open_beam
     metal = [KnownComponent.from_mesh(plate(), "titanium", pitch=0.2)]
@@ -68,7 +68,7 @@ def solved(name: str, beta: float) -> tuple[torch.Tensor, VolumeGrid, float, flo
     start, grid = time.perf_counter(), {"0.8 mm": COARSE, "0.267 mm": FINE}.get(name)
     if grid is None:
         grid = TwoLevelGrid.near(1 - unknown_share(metal, COARSE), COARSE, within_mm=6.0, factor=3)
-    strength = beta / 3 if grid is FINE else beta  # the same integral of the squared gradient
+    strength = beta / 3 if grid is FINE else beta  # for the same integral of the squared gradient
     config = PWLSConfig(iterations=12, subsets=20, beta=strength)
     volume = reconstruct(transmission, GEOMETRY, grid, beam, config=config, components=metal).volume
     seconds = time.perf_counter() - start
@@ -78,24 +78,24 @@ def solved(name: str, beta: float) -> tuple[torch.Tensor, VolumeGrid, float, flo
 
 
 def row(name: str, beta: float, volume: torch.Tensor, seconds: float, memory: float) -> str:
-    """A line of the table, of a volume on the fine grid."""
+    """Table row of a volume on the fine grid."""
     energy = (SPECTRUM.mean_energy,)
     water, calcium = (float(material(m).attenuation(energy)[0]) for m in ("water", "ca300"))
     share = KnownComponent.from_mesh(plate(), "titanium", pitch=0.2).fraction(FINE)
     near = (distance_to(share, FINE) < 5) & (share == 0)
     near &= cylinder_region(FINE, (0, 0, -5), (0, 0, 5), 22.0)
-    truth, alone, cells = torch.full(FINE.shape, water), near.clone(), []
+    truth, pure_water, cells = torch.full(FINE.shape, water), near.clone(), []
     for diameter in WIRES:
         wires = [at for at in PLACES if at[2] == diameter]
         inside = torch.zeros(FINE.shape, dtype=torch.bool)
         for x, y, _ in wires:
             inside |= cylinder_region(FINE, (x, y, -40), (x, y, 40), diameter / 2)
-            alone &= ~cylinder_region(FINE, (x, y, -40), (x, y, 40), diameter / 2 + 1.2)
+            pure_water &= ~cylinder_region(FINE, (x, y, -40), (x, y, 40), diameter / 2 + 1.2)
         truth[inside] = calcium
         cells.append(f"{(float(volume[inside & near].mean()) - water) / (calcium - water):.2f}")
-    error, found = (volume - truth)[near].square().mean().sqrt(), region_statistics(volume, alone)
+    error, background = (volume - truth)[near].square().mean().sqrt(), region_statistics(volume, pure_water)
     return (
-        f"| {beta:g} | {name} | {1e5 * error:.0f} | {1e5 * (found.mean - water):.0f} | {1e5 * found.std:.0f} "
+        f"| {beta:g} | {name} | {1e5 * error:.0f} | {1e5 * (background.mean - water):.0f} | {1e5 * background.std:.0f} "
         f"| {' | '.join(cells)} | {seconds:.0f} s | {memory:.2f} GiB |"
     )
 
@@ -127,13 +127,13 @@ def main(arguments: list[str] | None = None) -> None:
         ]
     )
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "two_levels.md").write_text(text)
+    write_report(options.out / "two_levels.md", text)
     figure = reconstruction_figure(shown, FINE, heights_mm=(0.0,), window=(0.01, 0.04))
     figure.savefig(options.out / "two_levels.png", dpi=120)
 
 
 def resampled(volume: torch.Tensor, grid: VolumeGrid, to: VolumeGrid) -> torch.Tensor:
-    """The nearest voxel's value, 0 beyond the outermost."""
+    """Value of the nearest voxel, 0 outside the grid."""
     points = to.points(dtype=torch.float64)
     matrix = grid.world_to_voxel
     index = (points @ matrix[:3, :3].mT + matrix[:3, 3]).round().long()

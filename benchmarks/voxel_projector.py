@@ -1,11 +1,11 @@
-"""Time and accuracy of the voxel projector beside RTK (itk-rtk) and mbirtorch, in one run on one machine.
+"""Time and accuracy of the voxel projector compared with RTK (itk-rtk) and mbirtorch, on one machine.
 
     python benchmarks/voxel_projector.py [--threads 1 2] [--rounds 3] [--out benchmarks/results]
 
-60 views of 256 x 256 pixels, 128^3 voxels of 1 mm, float32. The libraries take turns, and the best round counts.
-Peers that are not installed are left out with a word. Errors are those of the analytic chords of ellipsoids: a forward
-projection's of the voxelised phantom, against chords through pixel centres and averaged over pixels; a
-back-projection's is its distance from the adjoint, ``<A x, y> / <x, B y> - 1``; FDK's is that of the smooth insides.
+60 views of 256 x 256 pixels, 128^3 voxels of 1 mm, float32. The libraries run in turn, and the best of the rounds is
+reported. Libraries that are not installed are left out with a message. The phantom consists of ellipsoids. Errors:
+forward projection of the voxelised phantom, against analytic chords through pixel centres and averaged over pixels;
+back-projection, its deviation from the adjoint, `<A x, y> / <x, B y> - 1`; FDK, the error in the phantom's flat parts.
 Writes voxel_projector.md and voxel_projector.png.
 """
 
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import present, processor, timed
+from common import present, processor, timed, write_report
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
@@ -32,7 +32,7 @@ ELLIPSOIDS = (  # centre and half axes in mm, attenuation in 1/mm
     ((18.0, 6.0, -8.0), (14.0, 10.0, 20.0), 0.02),
     ((-20.0, -10.0, 12.0), (11.0, 12.0, 9.0), -0.01),
 )
-TILT_DEG = 0.5  # of the detector in its plane, in the row called "tilted"
+TILT_DEG = 0.5  # rotation of the detector in its plane, for the rows called "tilted"
 
 Operations = dict[str, Callable[[], Tensor]]
 
@@ -46,7 +46,7 @@ def scene() -> tuple[ConeBeamGeometry, VolumeGrid]:
 
 
 def tilted(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
-    """The geometry of a detector that is turned in its plane."""
+    """The geometry with its detector rotated by `TILT_DEG` in its plane."""
     angle, middle = torch.tensor(TILT_DEG).deg2rad(), (PIXELS - 1) / 2
     turn = torch.eye(3, dtype=torch.float64)
     turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
@@ -55,7 +55,7 @@ def tilted(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
 
 
 def voxelised(grid: VolumeGrid, finer: int = 4) -> Tensor:
-    """The phantom's mean in each voxel."""
+    """Mean of the phantom in each voxel."""
     volume = torch.zeros(grid.shape)
     line = (torch.arange(finer) + 0.5) / finer - 0.5
     points = grid.points()
@@ -67,12 +67,12 @@ def voxelised(grid: VolumeGrid, finer: int = 4) -> Tensor:
 
 
 def chords(geometry: ConeBeamGeometry, finer: int = 1) -> Tensor:
-    """Line integrals through pixel centres, or averaged over finer x finer rays a pixel."""
+    """Line integrals through pixel centres, or averaged over finer x finer rays per pixel."""
     fine = geometry.refined(finer)
     images = []
     for view in range(VIEWS):
-        one = fine.select([view])
-        rays, source, total = one.rays()[0], one.source_positions[0], 0
+        single_view = fine.select([view])
+        rays, source, total = single_view.rays()[0], single_view.source_positions[0], 0
         for center, axes, value in ELLIPSOIDS:
             half = torch.tensor(axes).double()
             along, start = rays / half, (source - torch.tensor(center)) / half
@@ -94,7 +94,7 @@ def ours(geometry: ConeBeamGeometry, volume: Tensor, images: Tensor, threads: in
 
 
 def rtk(geometry: ConeBeamGeometry, volume: Tensor, images: Tensor, threads: int) -> Operations:
-    """RTK turns about y: its x, y, z are our y, z, x."""
+    """RTK rotates about y: its x, y, z are our y, z, x."""
     import itk
     from itk import RTK
 
@@ -119,7 +119,7 @@ def rtk(geometry: ConeBeamGeometry, volume: Tensor, images: Tensor, threads: int
     def run(make, zeros: np.ndarray, step: tuple[float, float, float], second, turn_back: bool) -> Tensor:
         method = make.New()
         method.SetNumberOfWorkUnits(threads)
-        method.SetInput(0, image(zeros, step))  # anew, for the filters work in place
+        method.SetInput(0, image(zeros, step))  # a new image each time, since the filters work in place
         method.SetInput(1, second)
         method.SetGeometry(circle)
         method.Update()
@@ -134,7 +134,7 @@ def rtk(geometry: ConeBeamGeometry, volume: Tensor, images: Tensor, threads: int
 
 
 def mbirtorch(geometry: ConeBeamGeometry, volume: Tensor, images: Tensor, threads: int) -> Operations:
-    """mbirtorch has volumes (row, column, slice), its channels run the other way, and its angles."""
+    """mbirtorch orders volumes (row, column, slice); its channels and angles run in the opposite direction."""
     from mbirtorch import ConeBeamModel
 
     angles = np.deg2rad(90 - np.array(geometry.angles_deg))
@@ -152,9 +152,9 @@ LIBRARIES = {"torchkcreg": ours, "itk-rtk": rtk, "mbirtorch": mbirtorch}
 
 
 def error_of(operation: str, result: Tensor, forward: Tensor, volume: Tensor, images: Tensor, mean: Tensor) -> str:
-    """What the table says of a result's accuracy, in per cent."""
+    """Error of a result in per cent, as shown in the table."""
     if operation == "forward":
-        # rays that cross 10 mm and have no rim within four pixels, where averaging over a pixel would tell
+        # Rays through at least 10 mm, without an ellipsoid's edge within four pixels (there the pixel average matters).
         rims = torch.nn.functional.max_pool2d((images - mean).abs()[:, None], 9, 1, 4)[:, 0] > 0.01
         deep = (images > 0.2) & ~rims
         errors = [
@@ -167,12 +167,12 @@ def error_of(operation: str, result: Tensor, forward: Tensor, volume: Tensor, im
         return f"{100 * abs(defect):.5f}"
     whole = torch.nn.functional.max_pool3d
     flat = (-whole(-volume[None], 7, 1, 3) == whole(volume[None], 7, 1, 3))[0] & (volume > 0)
-    flat[: VOXELS // 4], flat[-VOXELS // 4 :] = False, False  # far from the plane of the source FDK is not exact
+    flat[: VOXELS // 4], flat[-VOXELS // 4 :] = False, False  # FDK is not exact far from the plane of the source
     return f"{100 * float((result - volume)[flat].norm() / volume[flat].norm()):.2f}"
 
 
 def measure(threads: int, rounds: int, names: list[str]) -> list[tuple[str, str, int, float, str]]:
-    """Rows (operation, library, threads, best seconds, error in per cent)."""
+    """Table rows (operation, library, threads, best seconds, error in per cent)."""
     torch.set_num_threads(threads)
     geometry, grid = scene()
     volume, images, mean = voxelised(grid), chords(geometry), chords(geometry, 4)
@@ -199,7 +199,7 @@ def table(rows: list[tuple[str, str, int, float, str]], names: list[str], left_o
     lines = [
         "# Voxel projector",
         "",
-        f"{VIEWS} views of {PIXELS} x {PIXELS}, {VOXELS}^3 voxels of 1 mm, float32; best of some rounds, in turns. "
+        f"{VIEWS} views of {PIXELS} x {PIXELS}, {VOXELS}^3 voxels of 1 mm, float32; best of some rounds, interleaved. "
         f"{processor()}; {', '.join(versions)}." + "".join(f" {name} is not installed." for name in left_out),
         "",
         "| operation | library | threads | seconds | of torchkcreg's time | error, % |",
@@ -211,8 +211,8 @@ def table(rows: list[tuple[str, str, int, float, str]], names: list[str], left_o
     lines += [
         "",
         "Errors: forward, RMS against an ellipsoid phantom's chords through pixel centres / averaged over pixels / the "
-        "latter where no rim is near (voxels blur rims); back, how far it is from being the adjoint of forward; FDK, "
-        "RMS in the flat parts near the plane of the source. Tilted: the detector turned "
+        "latter away from edges (voxels blur edges); back, deviation from the adjoint of forward; FDK, RMS in the flat "
+        "parts near the plane of the source. Tilted: the detector rotated by "
         f"{TILT_DEG} degrees in its plane, so that its columns are not parallel to the voxels'.",
         "",
     ]
@@ -255,7 +255,7 @@ def main(arguments: list[str] | None = None) -> None:
     text = table(rows, names, left_out)
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "voxel_projector.md").write_text(text)
+    write_report(options.out / "voxel_projector.md", text)
     draw(rows, options.out / "voxel_projector.png")
 
 

@@ -1,4 +1,4 @@
-"""Examples in docstrings, `>>>` lines, as blocks of code on the documentation's pages: an extension of griffe."""
+"""Griffe extension that shows the examples (`>>>` lines) of docstrings as code blocks in the documentation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import griffe
 
 
 def fenced(text: str) -> str:
-    """A docstring with its doctests between fences; a heading "Example:" over indented ones goes."""
+    """The docstring with its doctests in code fences. An "Example:" heading is dropped and its block unindented."""
     lines: list[str] = []
     inside = headed = False
     for line in text.splitlines():
@@ -28,7 +28,7 @@ def fenced(text: str) -> str:
 
 
 class Examples(griffe.Extension):
-    """Fences the examples of everything that has a docstring."""
+    """Puts the examples of all docstrings in code fences."""
 
     def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:

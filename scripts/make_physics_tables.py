@@ -1,7 +1,7 @@
 """Write the tables in torchkcreg/physics/data: attenuation of the elements (xraydb) and tungsten spectra (SpekPy).
 
-Run it where xraydb and SpekPy are installed (`pip install torchkcreg[simulate]`); the library itself needs neither.
-`materials.csv`, the compositions, is written by hand and says which elements are wanted.
+Needs xraydb and SpekPy (`pip install torchkcreg[simulate]`); the library itself needs neither. `materials.csv`, the
+compositions, is written by hand and determines which elements are tabulated.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ANODE_ANGLE_DEG = 12.0
 
 
 def wanted_elements() -> list[str]:
-    """Symbols of the elements that some composition names, by atomic number."""
+    """Symbols of the elements used in `materials.csv`, sorted by atomic number."""
     import xraydb
 
     symbols = set()
@@ -29,7 +29,7 @@ def wanted_elements() -> list[str]:
 
 
 def energy_grid(symbols: list[str]) -> np.ndarray:
-    """Energies in keV; an absorption edge of any of the elements stands twice."""
+    """Energies in keV. Each absorption edge of the elements is listed twice, for its two limits."""
     import xraydb
 
     low, high = ENERGY_RANGE_KEV
@@ -41,9 +41,10 @@ def energy_grid(symbols: list[str]) -> np.ndarray:
 
 
 def mass_attenuation(symbol: str, energies: np.ndarray) -> np.ndarray:
-    """Total mass attenuation of an element, cm^2/g; at an edge its limits from below and from above.
+    """Total mass attenuation of an element, cm^2/g; at an edge, the limits from below and from above.
 
-    The edges' energies and the jumps of xraydb's own table differ by a few eV: extrapolate from 10 and 20 eV off.
+    The edge energies and the jumps in xraydb's table differ by a few eV, so values at an edge are extrapolated from 10
+    and 20 eV beside it.
     """
     import xraydb
 
@@ -55,7 +56,7 @@ def mass_attenuation(symbol: str, energies: np.ndarray) -> np.ndarray:
 
 
 def write_elements() -> None:
-    """Mass attenuation coefficients (total, cm^2/g) of the wanted elements, one column each."""
+    """Write total mass attenuation coefficients (cm^2/g) of the elements, one column each."""
     symbols = wanted_elements()
     energies = energy_grid(symbols)
     columns = [mass_attenuation(symbol, energies) for symbol in symbols]
@@ -69,7 +70,7 @@ def write_elements() -> None:
 
 
 def write_spectra() -> None:
-    """Photons per keV that leave a tungsten anode, before any filter, one column a tube voltage."""
+    """Write unfiltered tungsten spectra (photons per keV), one column per tube voltage."""
     import spekpy
 
     low, high = ENERGY_RANGE_KEV[0], max(TUBE_VOLTAGES_KV)

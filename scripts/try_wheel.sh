@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Builds sdist and wheel, the wheel out of the sdist, and runs the installed wheel's self-test under other releases of torch.
+# Builds an sdist and, from it, a wheel; then runs the installed wheel's self-test under other releases of torch.
 #
 #     scripts/try_wheel.sh OUT torch==2.10.0 torch==2.14.1
 #
-# OUT is the folder for sdist and wheel. Needs an environment with torch, setuptools, wheel and ninja to build in: PYTHON, or
-# the python on the path. Each torch is some GB, unless pip finds builds without CUDA.
+# OUT is the folder for sdist and wheel. The build uses PYTHON (default: python on the path), which needs torch, setuptools,
+# wheel and ninja. Each torch takes several GB, unless pip finds builds without CUDA.
 set -euo pipefail
 out="$(realpath -m "$1")"
 shift

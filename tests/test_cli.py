@@ -161,7 +161,7 @@ def test_compare_refuses_what_cannot_be_told(finished, capsys):
     assert main(["compare", str(finished), str(finished), "--loads", "1", "2"]) == 2
     assert "1 loaded runs need as many loads, got 2" in the_error(capsys, "compare")
     assert main(["compare", str(finished), str(finished), "--plane", "0", "0", "500"]) == 2
-    assert "say where the fracture is by a plane" in the_error(capsys, "compare")
+    assert "give the plane of the fracture" in the_error(capsys, "compare")
     assert main(["compare", str(finished), str(finished), "--plane", "0", "0"]) == 2
     assert "3 or 6 numbers, got 2" in the_error(capsys, "compare")
 
@@ -194,7 +194,7 @@ def test_info_alone_says_what_is_installed_and_which_projector_runs(capsys):
 def test_info_of_a_file_of_another_kind_is_an_error(tmp_path, capsys):
     (tmp_path / "notes.md").write_text("90 kV")
     assert main(["info", str(tmp_path / "notes.md")]) == 2
-    assert "none of what can be described" in the_error(capsys, "info")
+    assert "cannot be described" in the_error(capsys, "info")
 
 
 def test_the_same_seed_gives_the_same_bits(small_case, finished, tmp_path):

@@ -8,24 +8,26 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .deformation import FreeFormDeformation
     from .geometry import ConeBeamGeometry, MultisourceScanner, VolumeGrid, circular_geometry
-    from .implant import Component, ImplantPointCloud, Screw, find_holes
+    from .implant import Component, ImplantPointCloud, KnownComponent, Screw, find_holes
     from .io import read_components, read_geometry, read_mesh, read_projections, read_run
     from .physics import PolyenergeticTransmission, line_integrals_from_intensity, material, tungsten_spectrum
     from .projector import PointCloudProjector, project_mesh, project_points
     from .reconstruction import fdk, reconstruct
-    from .registration import Implant, RegistrationConfig, RegistrationResult, Stage, register
-    from .scene import RegistrationData, Scene
+    from .registration import Implant, RegistrationConfig, RegistrationResult, Stage, build_scene, register
+    from .scene import Assembly, RegistrationData, Scene
     from .similarity import GradientCorrelationLoss, gradient_correlation
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Assembly": "scene",
     "Component": "implant",
     "ConeBeamGeometry": "geometry",
     "FreeFormDeformation": "deformation",
     "GradientCorrelationLoss": "similarity",
     "Implant": "registration",
     "ImplantPointCloud": "implant",
+    "KnownComponent": "implant",
     "MultisourceScanner": "geometry",
     "PointCloudProjector": "projector",
     "PolyenergeticTransmission": "physics",
@@ -36,6 +38,7 @@ _HOMES = {
     "Screw": "implant",
     "Stage": "registration",
     "VolumeGrid": "geometry",
+    "build_scene": "registration",
     "circular_geometry": "geometry",
     "fdk": "reconstruction",
     "find_holes": "implant",
@@ -76,45 +79,11 @@ _FOLDERS = (
     "visualization",
 )
 
-__all__ = [
-    "Component",
-    "ConeBeamGeometry",
-    "FreeFormDeformation",
-    "GradientCorrelationLoss",
-    "Implant",
-    "ImplantPointCloud",
-    "MultisourceScanner",
-    "PointCloudProjector",
-    "PolyenergeticTransmission",
-    "RegistrationConfig",
-    "RegistrationData",
-    "RegistrationResult",
-    "Scene",
-    "Screw",
-    "Stage",
-    "VolumeGrid",
-    "__version__",
-    "circular_geometry",
-    "fdk",
-    "find_holes",
-    "gradient_correlation",
-    "line_integrals_from_intensity",
-    "material",
-    "project_mesh",
-    "project_points",
-    "read_components",
-    "read_geometry",
-    "read_mesh",
-    "read_projections",
-    "read_run",
-    "reconstruct",
-    "register",
-    "tungsten_spectrum",
-]
+__all__ = ["__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
-    """A public name or folder, imported when it is first asked for (PEP 562): the package alone does not load torch."""
+    """Import a public name or folder when it is first used (PEP 562): `import torchkcreg` alone does not load torch."""
     if name in _FOLDERS:
         return importlib.import_module(f".{name}", __name__)
     if name not in _HOMES:
@@ -125,4 +94,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_FOLDERS})
+    return sorted([*__all__, *_FOLDERS])

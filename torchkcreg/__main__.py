@@ -1,4 +1,4 @@
-"""`python -m torchkcreg`."""
+"""Command line: `python -m torchkcreg`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What people read: what a command found, warnings of a line each, an error of one line, and tables."""
+"""Console output of the commands: results, one-line warnings and errors, and tables."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _PACKAGE = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command found.
+    """Result of a command.
 
     Attributes:
-        text: for people.
-        data: the same for programs, plain data by name.
-        status: exit status.
+        text: Result for people.
+        data: The same for programs, as plain data by name.
+        status: Exit status.
     """
 
     text: str
@@ -39,13 +39,13 @@ class Answer:
 
 @dataclass(frozen=True)
 class Voice:
-    """How much a command says, and to whom.
+    """Amount and format of a command's output.
 
     Attributes:
-        quiet: nothing but warnings and errors.
-        verbose: each step with the time it came at.
-        json: one JSON object on stdout with what was found and the warnings; all else on stderr.
-        debug: errors are raised, with their traceback.
+        quiet: Print only warnings and errors.
+        verbose: Log each step with the elapsed time.
+        json: Print one JSON object with the result and the warnings on stdout, and everything else on stderr.
+        debug: Raise errors with their traceback.
     """
 
     quiet: bool = False
@@ -55,18 +55,18 @@ class Voice:
 
 
 def run_command(name: str, command: Callable[[], Answer | None], voice: Voice = Voice()) -> int:
-    """The exit status of a command: its own, or that of its failure, which is told on stderr in one line.
+    """Run a command, print its result, and return its exit status. An error is printed on stderr in one line.
 
     Args:
-        name: What the lines begin with.
-        command: Returns what it found.
-        voice: How much is said.
+        name: Name of the command, printed before each warning and error.
+        command: Function that runs the command and returns its result.
+        voice: Amount and format of the output.
     """
-    told: list[str] = []
+    warnings_shown: list[str] = []
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        told.append(one_line(message))
-        print(f"{name}: warning: {told[-1]}", file=sys.stderr)
+        warnings_shown.append(one_line(message))
+        print(f"{name}: warning: {warnings_shown[-1]}", file=sys.stderr)
 
     try:
         with warnings.catch_warnings(), _spoken(name, voice):
@@ -75,7 +75,7 @@ def run_command(name: str, command: Callable[[], Answer | None], voice: Voice = 
             warnings.showwarning = show
             answer = command() or Answer("")
         if voice.json:
-            print(json.dumps(plain({**answer.data, "warnings": told}), allow_nan=False))
+            print(json.dumps(plain({**answer.data, "warnings": warnings_shown}), allow_nan=False))
         elif answer.text and not voice.quiet:
             print(answer.text)
         return answer.status
@@ -91,7 +91,7 @@ def run_command(name: str, command: Callable[[], Answer | None], voice: Voice = 
 
 @contextlib.contextmanager
 def _spoken(name: str, voice: Voice) -> Iterator[None]:
-    """Progress and what is printed on the way go where they belong; steps are logged if that was asked."""
+    """Silence progress bars, redirect printed text and log steps, as `voice` asks."""
     silence(voice.quiet)
     log, handler, start = logging.getLogger("torchkcreg"), logging.StreamHandler(), time.perf_counter()
     handler.format = lambda record: f"{name}: {time.perf_counter() - start:7.1f} s  {record.getMessage()}"  # type: ignore[method-assign]
@@ -116,15 +116,15 @@ def one_line(message: object) -> str:
 
 
 def _told(error: Exception) -> str:
-    """An error in one line; one that nothing foresaw with its kind, and the step of the package that it came from."""
+    """Error message in one line. Unexpected errors also name their type and the module they came from."""
     if isinstance(error, (ValueError, OSError)) and not isinstance(error, UnicodeError):
         return one_line(error)
-    where = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)[1:]]
-    steps = [path.relative_to(_PACKAGE).with_suffix("") for path in where if path.is_relative_to(_PACKAGE)]
+    files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)[1:]]
+    steps = [path.relative_to(_PACKAGE).with_suffix("") for path in files if path.is_relative_to(_PACKAGE)]
     step = f" in {'.'.join(steps[-1].parts)}" if steps else ""
     memory = isinstance(error, MemoryError) or "not enough memory" in str(error)
-    what = "out of memory" if memory else f"{type(error).__name__}: {one_line(error)[:200]}"
-    return f"{what}{step} (--debug shows the traceback)"
+    problem = "out of memory" if memory else f"{type(error).__name__}: {one_line(error)[:200]}"
+    return f"{problem}{step} (--debug shows the traceback)"
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -1,4 +1,4 @@
-"""Options as checked, unchanging objects, from Python, YAML or JSON alike."""
+"""Options as validated, immutable objects, from Python, YAML or JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _Config = TypeVar("_Config", bound="Config")
 
 
 class Config(BaseModel):
-    """Options that are checked when they are made, and don't change; unknown ones are refused.
+    """Immutable options, validated on creation. Unknown options are an error.
 
     >>> class Walk(Config):
     ...     steps: int = 10
@@ -24,14 +24,14 @@ class Config(BaseModel):
 
     @classmethod
     def of(cls: type[_Config], options: Mapping[str, Any], source: str = "options") -> _Config:
-        """The options of a file.
+        """Options from a mapping, such as the content of a file.
 
         Args:
-            options: By their names.
-            source: What an error calls them.
+            options: Values by their names.
+            source: Name of the source in error messages.
 
         Raises:
-            ValueError: For unknown names and wrong values, in one line that names them all.
+            ValueError: If there are unknown names or invalid values. The message lists all of them in one line.
         """
         try:
             return cls.model_validate(dict(options))

@@ -1,4 +1,4 @@
-"""Plain types: what JSON, YAML and checkpoints hold, and numbers out of them."""
+"""Conversion to plain types for JSON, YAML and checkpoints, and checks of values read from them."""
 
 from __future__ import annotations
 
@@ -11,47 +11,47 @@ import torch
 
 
 def plain(content: Any) -> Any:
-    """`content` as numbers, strings, lists and dicts: what JSON, YAML and a checkpoint can hold.
+    """`content` as numbers, strings, lists and dicts, for JSON, YAML and checkpoints.
 
-    Tensors and arrays become (nested) lists, NumPy scalars numbers, tuples lists, paths strings. JSON knows no NaN
-    and no infinity: they become None.
+    Tensors and arrays become (nested) lists, NumPy scalars numbers, tuples lists, paths strings. NaN and
+    infinity become None, since JSON has neither.
 
     Raises:
-        ValueError: something else is in it; names its type and where it is.
+        ValueError: If it holds anything else. The message names the type and its place.
     """
     return _plain(content, "")
 
 
-def _plain(content: Any, where: str) -> Any:
+def _plain(content: Any, place: str) -> Any:
     if content is None or isinstance(content, (bool, int, str)):
         return content
     if isinstance(content, float):
         return float(content) if math.isfinite(content) else None
     if isinstance(content, torch.Tensor):
-        return _plain(content.detach().cpu().tolist(), where)
+        return _plain(content.detach().cpu().tolist(), place)
     if isinstance(content, (np.ndarray, np.generic)):
-        return _plain(content.tolist(), where)
+        return _plain(content.tolist(), place)
     if isinstance(content, os.PathLike):
         return os.fspath(content)
     if isinstance(content, dict):
-        return {str(key): _plain(value, f"{where}[{key!r}]") for key, value in content.items()}
+        return {str(key): _plain(value, f"{place}[{key!r}]") for key, value in content.items()}
     if isinstance(content, (list, tuple)):
-        return [_plain(value, f"{where}[{i}]") for i, value in enumerate(content)]
-    raise ValueError(f"cannot write a {type(content).__name__} as plain data{f' (at {where})' if where else ''}")
+        return [_plain(value, f"{place}[{i}]") for i, value in enumerate(content)]
+    raise ValueError(f"cannot write a {type(content).__name__} as plain data{f' (at {place})' if place else ''}")
 
 
 def finite_number(value: Any, name: str, *, positive: bool = False) -> float:
-    """`value` as a float; ValueError(name ...) when it is no finite number, or not above zero where asked."""
-    wanted = "a positive number" if positive else "a finite number"
+    """`value` as a float. Raises ValueError unless it is a finite number, and above zero if `positive`."""
+    expected = "a positive number" if positive else "a finite number"
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+        raise ValueError(f"{name} must be {expected}, got {value!r}")
     if positive and value <= 0:
-        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+        raise ValueError(f"{name} must be {expected}, got {value!r}")
     return float(value)
 
 
 def finite_array(value: Any, shape: tuple[int, ...], name: str) -> torch.Tensor:
-    """`value` (nested lists) as a float64 tensor of `shape`; ValueError(name ...) when it is anything else."""
+    """`value` (nested lists) as a float64 tensor of `shape`. Raises ValueError if it is anything else."""
     try:
         array = np.array(value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value)
     except ValueError:
@@ -69,7 +69,7 @@ def _short(value: Any) -> str:
 
 
 def require_keys(content: Any, keys: tuple[str, ...], where: str = "") -> None:
-    """ValueError that names the first key which `content`, that should be a dict, lacks."""
+    """Raise ValueError if `content` is not a dict or lacks a key; the message names the first missing one."""
     if not isinstance(content, dict):
         raise ValueError(f"what should hold the {keys[0]!r}{where} must be an object, got {type(content).__name__}")
     for key in keys:

@@ -1,4 +1,4 @@
-"""What keeps its precision: operations under autocast, and the poses and matrices of modules."""
+"""Keeps full precision: of operations under autocast, and of the poses and matrices of modules."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def full_precision(function: _Function) -> _Function:
-    """The function with `torch.autocast` switched off, and what layers before it made of half precision as float32.
+    """Decorator: runs a function with `torch.autocast` off and half-precision tensors converted to float32.
 
-    A pixel coordinate in the hundreds has three digits in bfloat16, and a path length is a difference of large sums.
+    bfloat16 has two to three significant digits. That is too few for pixel coordinates in the hundreds, and for path
+    lengths, which are differences of large sums.
     """
 
     @functools.wraps(function)
@@ -39,17 +40,17 @@ def _single(value: Any) -> Any:
 
 
 class ExactModule(nn.Module):
-    """A module some of whose buffers follow it to other devices but keep their precision whatever it is cast to.
+    """Module whose `exact_buffers` move to other devices with it but keep their precision when it is cast.
 
-    A pose in single precision is off by micrometres, a projection matrix by thousandths of a pixel.
+    In single precision a pose is off by micrometres and a projection matrix by thousandths of a pixel.
     """
 
     exact_buffers: ClassVar[tuple[str, ...]] = ()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ExactModule:
-        kept = {name: getattr(self, name) for name in self.exact_buffers}
+        exact = {name: getattr(self, name) for name in self.exact_buffers}
         super()._apply(fn, recurse)
-        for name, value in kept.items():
+        for name, value in exact.items():
             moved = getattr(self, name)
             if moved.dtype != value.dtype:  # follow .to(device), but not .float()
                 setattr(self, name, value.to(moved.device))

@@ -1,4 +1,4 @@
-"""Progress bars with the time that is left, which one call silences."""
+"""Progress bars with the remaining time, which can all be switched off."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ _silent = False
 
 
 def silence(silent: bool = True) -> None:
-    """No bar is shown from now on, whatever a function is asked for; or bars are shown again."""
+    """Switch all progress bars off, also those that are asked for explicitly, or on again."""
     global _silent
     _silent = silent
 
 
-def progress_bar(iterable: Iterable[Any] | None = None, *, shown: bool | None = None, **how: Any) -> tqdm:
-    """A `tqdm` bar.
+def progress_bar(iterable: Iterable[Any] | None = None, *, shown: bool | None = None, **options: Any) -> tqdm:
+    """Make a `tqdm` progress bar.
 
     Args:
-        iterable: what it goes through.
-        shown: whether it is shown; None where the output is a terminal.
-        how: as of `tqdm`: total, desc, initial, leave.
+        iterable: Items to iterate over.
+        shown: True to show it. None: only if the output is a terminal.
+        options: Options of `tqdm`: total, desc, initial, leave.
     """
     disable = True if _silent else None if shown is None else not shown
-    return tqdm(iterable, disable=disable, **how)
+    return tqdm(iterable, disable=disable, **options)

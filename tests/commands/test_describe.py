@@ -45,7 +45,7 @@ def test_projections_are_described_with_what_is_masked(tmp_path):
 
 def test_what_cannot_be_described_is_an_error(small_case, tmp_path):
     (tmp_path / "notes.md").write_text("90 kV")
-    with pytest.raises(ValueError, match="none of what can be described"):
+    with pytest.raises(ValueError, match="cannot be described"):
         describe(tmp_path / "notes.md")
     (tmp_path / "o.json").write_text('{"tube": 90}')
     assert "JSON with tube: neither geometry" in describe(tmp_path / "o.json")

@@ -76,7 +76,7 @@ def test_wrong_options_are_one_line_with_every_problem(tmp_path):
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_written(files, tmp_path):
-    with pytest.raises(ValueError, match="device 'nowhere' is not to be had"):
+    with pytest.raises(ValueError, match="device 'nowhere' is not available"):
         register_files(files, tmp_path / "run", overrides={"device": "nowhere"})
     with pytest.raises(ValueError, match="backend must be one of auto, cpp, triton, torch, got 'fast'"):
         register_files(files, tmp_path / "run", overrides={"backend": "fast"})

@@ -83,7 +83,7 @@ def test_what_does_not_pair_with_the_implants_is_refused(files, tmp_path, capsys
     implants = [f"--implant={folder / f'{name}.stl'}" for name in ("medial", "lateral")]
     out = f"--out={tmp_path / 'run'}"
     assert main(command(folder, *implants, f"--init={folder / 'medial.json'}", out)) == 2
-    assert "2 implants need as many init, got 1; - stands for none" in capsys.readouterr().err
+    assert "2 implants need as many init, got 1; use - for none" in capsys.readouterr().err
     assert main(command(folder, implants[0], implants[0], out)) == 2
     assert "medial is there 2 times" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

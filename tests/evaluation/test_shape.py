@@ -72,7 +72,7 @@ def test_between_lattices_of_one_shape_there_is_the_floor(body, nodes):
 
 def test_a_reference_in_another_frame_is_brought_here_and_has_no_errors_before(body, nodes):
     far = rigid_matrix(torch.tensor([1.0, 2.0, -0.5]).double(), torch.tensor([50.0, 30.0, -200.0]).double())
-    with pytest.warns(UserWarning, match="stands in another frame"):
+    with pytest.warns(UserWarning, match="is in another frame"):
         found = evaluate_shape(body, nodes, moved(body, lambda p: transform_points(far, p)), pitch_mm=0.5)
     assert found.surface_before is None and found.nodes_before is None and found.errors_before is None
     assert found.surface_after.max_mm < 1e-3

@@ -67,7 +67,7 @@ def test_shadows_that_were_missed_or_mistaken_do_little():
 
 def test_angles_counted_in_the_wrong_sense_are_told():
     nonsense = torch.rand(60, 2, 2, generator=torch.Generator().manual_seed(0)) * 200
-    with pytest.raises(ValueError, match="the sense in which they count"):
+    with pytest.raises(ValueError, match="the direction of rotation"):
         calibrate(TOLD, nonsense)
     backwards = calibrate(circular_geometry([-a for a in ANGLES], **SIZE), tracks(TOLD))
     assert backwards.median_px > 20 * calibrate(TOLD, tracks(TOLD)).median_px

@@ -197,9 +197,9 @@ def test_leaps_and_tigres_axis_beside_the_central_ray():
     torch.testing.assert_close(seen, torch.tensor([[[18.0, 10.0]]]).double())
     with pytest.raises(ValueError, match="mode cone, got parallel"):
         from_tigre(SimpleNamespace(mode="parallel"), [0.0])
-    with pytest.raises(ValueError, match="turned in itself"):
+    with pytest.raises(ValueError, match="rotated detector"):
         from_tigre(SimpleNamespace(rotDetector=(0.0, 0.1, 0.0)), [0.0])
-    with pytest.raises(ValueError, match="one turn about z a view"):
+    with pytest.raises(ValueError, match="one rotation about z per view"):
         from_tigre(tigre, torch.zeros(2, 3))
 
 

@@ -63,7 +63,7 @@ def test_a_folder_has_one_file_a_view_in_the_order_of_their_numbers(tmp_path, su
 
 
 def test_a_folder_whose_files_do_not_belong_together_is_refused_or_doubted(tmp_path):
-    with pytest.raises(ValueError, match="this one no images"):
+    with pytest.raises(ValueError, match="this one holds no images"):
         read_projections(tmp_path)
     for index in (0, 1, 2, 4, 5):
         image(tmp_path / f"view_{index:03}.tif", RAW[index].astype(np.float32))

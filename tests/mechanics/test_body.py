@@ -155,6 +155,6 @@ def test_displacements_go_on_beside_the_implant(bar: Bar) -> None:
 
 
 def test_constants_are_known_of_alloys_alone() -> None:
-    with pytest.raises(ValueError, match=r"elastic constants are known of .*steel.*, not of water"):
+    with pytest.raises(ValueError, match=r"elastic constants are available for .*steel.*, not for water"):
         elastic_constants("water")
     assert elastic_constants("316L") == STEEL

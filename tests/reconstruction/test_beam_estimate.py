@@ -117,12 +117,12 @@ def test_what_tells_nothing_is_refused(scans):
     with pytest.raises(ValueError, match="there are no components"):
         estimate_beam(transmission, GEOMETRY, GRID, [])
     needle = trimesh.creation.box((0.3, 0.3, 2.0))
-    with pytest.raises(ValueError, match="too few to tell the beam: give a spectrum"):
+    with pytest.raises(ValueError, match="too few to estimate the beam: give a spectrum"):
         estimate_beam(transmission, GEOMETRY, GRID, [KnownComponent.from_mesh(needle, "titanium", pitch=0.1)])
 
 
 def test_an_estimate_that_is_unlikely_is_told(scans):
-    with pytest.warns(UserWarning, match="titanium comes out with .* is it another metal"):
+    with pytest.warns(UserWarning, match="titanium is fitted with .* wrong metal"):
         estimate_beam(scans["steel", 80.0], GEOMETRY, GRID, [component("titanium")], spectrum=tungsten_spectrum(80.0))
     alone = component_path_lengths([component("titanium")], GEOMETRY)
     bare = Beam.of([material("titanium")], tungsten_spectrum(90.0)).transmission(alone[None].double())[0].float()

@@ -84,7 +84,7 @@ def test_a_file_gives_some_of_its_views(scan, tmp_path, suffix):
 
 def test_files_that_cannot_be_read_in_parts_are_refused(tmp_path):
     write_projections(tmp_path / "scan.npz", line_integrals=torch.ones(2, 3, 4))
-    with pytest.raises(ValueError, match="views are read one by one from"):
+    with pytest.raises(ValueError, match="single views cannot be read from"):
         ProjectionFile(tmp_path / "scan.npz")
     (tmp_path / "scan.npy").write_bytes(b"no array")
     with pytest.raises(ValueError, match=r"scan\.npy: "):
@@ -112,7 +112,7 @@ def test_known_components_are_reconstructed_from_views_as_they_are_read(scan, tm
     torch.testing.assert_close(streamed.data.line_integrals, whole.data.line_integrals)
     torch.testing.assert_close(streamed.scatter, whole.scatter)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(ValueError, match="gives their masks as well"):
+    with pytest.raises(ValueError, match="also returns their masks"):
         reconstruct(read, geometry, GRID, beam, mask=mask, **options)
     with pytest.raises(ValueError, match="transmission must have shape"):
         reconstruct(transmission[:4], geometry, GRID, beam, **options)

@@ -98,7 +98,7 @@ def test_a_similarity_of_ones_own_is_used() -> None:
 def test_a_similarity_that_is_no_sum_of_squares_is_refused_by_gauss_newton_by_name() -> None:
     data = image(scene(RIGIDLY))
     config = RIGIDLY.model_copy(update={"stages": (Stage(),)})
-    with pytest.raises(NotImplementedError, match="Correlation is no sum of squares"):
+    with pytest.raises(NotImplementedError, match="Correlation is not a sum of squares"):
         register(plate(), data, config, similarity=Correlation)
 
 

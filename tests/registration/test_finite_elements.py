@@ -75,7 +75,7 @@ def test_damaged_or_missing_arrays_are_named(found, tmp_path) -> None:
 def test_a_body_of_nothing_known_is_refused() -> None:
     with pytest.raises(ValueError, match="finite elements need the implant's material"):
         build_scene(plate(), CONFIG)
-    with pytest.raises(ValueError, match="elastic constants are known of"):
+    with pytest.raises(ValueError, match="elastic constants are available for"):
         build_scene(Implant(plate(), material="water", holds=HOLDS), CONFIG)
 
 

@@ -21,8 +21,8 @@ def _guarded():
 
 def test_a_stage_that_explains_less_of_the_images_is_undone(guarded) -> None:
     here, guard = guarded
-    before = here.assemblies[0].implant_to_world.clone()
-    here.assemblies[0].implant_to_world.copy_(pose(3.0, 2.0))
+    before = here.assemblies[0].implant_to_world.detach()
+    here.assemblies[0].implant_to_world = pose(3.0, 2.0)
     reason = guard.after()
     assert reason is not None
     assert "unexplained" in reason
@@ -34,7 +34,7 @@ def test_a_stage_that_explains_more_of_them_stands() -> None:
     here = scene(CONFIG, pose(3.0, 2.0))
     guard = Guard(here, images, CONFIG)
     guard.before(RIGID[-1])
-    here.assemblies[0].implant_to_world.copy_(torch.eye(4))
+    here.assemblies[0].implant_to_world = torch.eye(4)
     assert guard.after() is None
     assert (here.assemblies[0].implant_to_world == torch.eye(4)).all()
 
@@ -49,13 +49,15 @@ def test_what_is_not_finite_is_undone(guarded) -> None:
 
 def test_metal_does_not_stretch_and_implants_do_not_fly_away() -> None:
     here = scene(CONFIG)
-    start = here.assemblies[0].implant_to_world.clone()
+    start = here.assemblies[0].implant_to_world.detach()
     assert implausible(here, [start]) is None
     bend(here, 0.02)
     assert implausible(here, [start]) is None
-    here.assemblies[0].implant_to_world[0, 3] += 500.0
+    away = torch.eye(4, dtype=torch.float64)
+    away[0, 3] = 500.0
+    here.assemblies[0].implant_to_world = away @ here.assemblies[0].implant_to_world
     assert "500 mm" in implausible(here, [start])
-    here.assemblies[0].implant_to_world.copy_(start)
+    here.assemblies[0].implant_to_world = start
     bend(here, 2.0)
     assert "strained" in implausible(here, [start])
 

@@ -115,7 +115,7 @@ def test_a_load_is_registered():
 
 def test_silent_failures_and_loads_are_told(pretended, tmp_path):
     _, text = run_study("population", StudyOptions(cases=8), tmp_path, workers=1)
-    assert "silent failures 3 [5, 6, 7]" in text and "idle alarms 0 []" in text
+    assert "silent failures 3 [5, 6, 7]" in text and "false alarms 0 []" in text
     assert "bending moments, gap, of 8: error median 10 N mm, 1.0% of them; 8 within 5 %" in text
     assert "bending moments, largest, of 8: error median 200 N mm, 22.2% of them; 0 within" in text
 

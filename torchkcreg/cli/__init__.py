@@ -1,4 +1,4 @@
-"""The command line: ``torchkcreg register | warp | evaluate | load | compare | simulate | reconstruct | ...``."""
+"""The command line: `torchkcreg register | warp | evaluate | load | compare | simulate | reconstruct | ...`."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from .simulate import add_simulate
 from .study import add_study
 from .warp import add_warp
 
-# Before torch starts its threads. Between small operations they wait by spinning for a few microseconds: asleep at
-# once, they double the time of a registration; spinning for long, they stop each other where other programs run.
+# Must be set before torch starts its threads: idle threads then spin for a few microseconds before they sleep. If they
+# sleep at once, a registration takes twice as long; if they spin for long, they slow down when other programs run.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns its exit status.
+    """Run one command and return its exit status.
 
-    0, or 2 after a one-line error that names what was wrong, or 3 after a registration whose result, which is written,
-    is not to be trusted.
+    0: success. 2: an error, reported in one line. 3: a registration failed; its run folder is written, but the result
+    must not be used.
     """
     try:
         options = _parser().parse_args(arguments)
-    except SystemExit as done:  # argparse is done after --help, --version, or a wrong flag
+    except SystemExit as done:  # argparse exits after --help, --version, or a wrong flag
         return int(done.code or 0)
     return run_command(f"torchkcreg {options.command}", lambda: options.run(options), voice_of(options))
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, like all the others."""
+    """An argument parser that reports errors in one line, like all other errors."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {one_line(message)}\n")

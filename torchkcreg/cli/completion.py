@@ -1,4 +1,4 @@
-"""``torchkcreg completion``: what a shell needs to complete commands and flags."""
+"""`torchkcreg completion`: shell completion of commands and flags."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from .command import add_command
 
 
 def add_completion(commands, parser: Callable[[], argparse.ArgumentParser]) -> None:
-    """Adds the command.
+    """Add the flags of `torchkcreg completion`.
 
     Args:
-        commands: Where to.
-        parser: Makes the whole parser, of which the commands are completed.
+        commands: Subparsers of the main parser.
+        parser: Builds the main parser, whose commands and flags are completed.
     """
-    text = "print what a shell needs to complete commands and flags (extra completion)"
+    text = "print a script for shell completion of commands and flags (needs torchkcreg[completion])"
     command = add_command(commands, "completion", lambda options: _completion(options, parser), text)
-    where = "for bash: torchkcreg completion bash > ~/.local/share/bash-completion/completions/torchkcreg"
-    command.add_argument("shell", choices=("bash", "zsh", "tcsh"), help=where)
+    usage = "for bash: torchkcreg completion bash > ~/.local/share/bash-completion/completions/torchkcreg"
+    command.add_argument("shell", choices=("bash", "zsh", "tcsh"), help=usage)
 
 
 def _completion(options: argparse.Namespace, parser: Callable[[], argparse.ArgumentParser]) -> Answer:

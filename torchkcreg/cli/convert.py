@@ -1,4 +1,4 @@
-"""``torchkcreg convert``: geometries, meshes and projections from one format into another."""
+"""`torchkcreg convert`: convert geometries, meshes and projections between file formats."""
 
 from __future__ import annotations
 
@@ -11,32 +11,36 @@ from .command import add_command
 
 
 def add_convert(commands) -> None:
-    """Adds the command."""
-    text = "convert a geometry, a mesh or projections into another format, by the target's ending"
+    """Add the flags of `torchkcreg convert`."""
+    text = "convert a geometry, a mesh or projections; the target's suffix gives the format"
     command = add_command(commands, "convert", _convert, text)
-    command.add_argument("source", type=Path, help="geometry, mesh, or projections: any that is read")
+    command.add_argument("source", type=Path, help="geometry, mesh or projections, in any format that can be read")
     command.add_argument(
         "target",
         type=Path,
         help="geometry: JSON, XML, NPY, NPZ, CSV; mesh: STL, PLY, OBJ, OFF; line integrals: MHA, NRRD, NII",
     )
-    command.add_argument("--projections", type=Path, help="image whose header says what the pixels are (MHA, NRRD)")
-    command.add_argument("--rows", type=int, help="of the detector, where no header says it")
-    command.add_argument("--cols", type=int, help="of the detector")
-    pitch = "between rows and between columns, one number or two"
+    command.add_argument(
+        "--projections", type=Path, help="image whose header gives number and size of the pixels (MHA, NRRD)"
+    )
+    command.add_argument("--rows", type=int, help="detector rows, if no header gives them")
+    command.add_argument("--cols", type=int, help="detector columns, if no header gives them")
+    pitch = "pixel pitch: one number, or between rows and between columns"
     command.add_argument("--pixel-pitch", type=float, nargs="+", metavar="MM", help=pitch)
-    layout = "of twelve numbers a view: matrices, or astra (source, detector, column step, row step in mm)"
+    layout = "meaning of twelve numbers per view: matrices, or astra (source, detector, column step, row step in mm)"
     command.add_argument("--layout", choices=("matrices", "astra"), help=layout)
-    axis = "the source's world has this axis for the gantry's (RTK: y); the target's has z"
+    axis = "rotation axis of the gantry in the source's world (RTK: y); in the target it is z"
     command.add_argument("--gantry-axis", choices=("x", "y", "z"), default="z", help=axis)
-    command.add_argument("--open-beam", type=float, help="of projections, where their file does not say it")
-    command.add_argument("--overwrite", action="store_true", help="replace the target")
+    command.add_argument(
+        "--open-beam", type=float, help="unattenuated intensity of projections, if their file does not give it"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace the target if it exists")
 
 
 def _convert(options: argparse.Namespace) -> Answer:
     from torchkcreg.commands import convert
 
-    said = convert(
+    summary = convert(
         options.source,
         options.target,
         projections=options.projections,
@@ -47,4 +51,4 @@ def _convert(options: argparse.Namespace) -> Answer:
         open_beam=options.open_beam,
         overwrite=options.overwrite,
     )
-    return Answer(said, {"target": options.target, "said": said})
+    return Answer(summary, {"target": options.target, "said": summary})

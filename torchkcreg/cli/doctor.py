@@ -1,4 +1,4 @@
-"""``torchkcreg doctor``: whether the installation works."""
+"""`torchkcreg doctor`: check of the installation."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ UNHEALTHY = 1
 
 
 def add_doctor(commands) -> None:
-    """Adds the command."""
-    text = "look whether the installation works: versions, kernels, threads, and a self-test of some seconds"
+    """Add the flags of `torchkcreg doctor`."""
+    text = "check the installation: versions, compiled kernels, threads, and a self-test of a few seconds"
     add_command(commands, "doctor", _doctor, text)
 
 

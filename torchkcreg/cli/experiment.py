@@ -1,4 +1,4 @@
-"""``torchkcreg experiment``: the paper's two experiments."""
+"""`torchkcreg experiment`: the paper's two experiments."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from .command import add_command
 
 
 def add_experiment(commands) -> None:
-    """Adds the command."""
-    text = "simulate, register and evaluate the paper's experiments: tables and figures; what is there is kept"
+    """Add the flags of `torchkcreg experiment`."""
+    text = "simulate, register and evaluate one of the paper's two experiments; finished parts in the folder are kept"
     command = add_command(commands, "experiment", _experiment, text)
     names = ("tibial-plate", "femoral-plate")
     command.add_argument("name", choices=names, metavar="NAME", help=" or ".join(names))
     command.add_argument("--quick", action="store_true", help="few loads and views, coarse pixels: a few minutes")
-    command.add_argument("--blind", action="store_true", help="screws and spectrum are not told")
+    command.add_argument("--blind", action="store_true", help="do not give screws and spectrum to the registration")
     command.add_argument(
-        "--paper", action="store_true", help="with the paper's own settings, too: minutes for each load"
+        "--paper", action="store_true", help="also register with the paper's settings: minutes for each load"
     )
-    command.add_argument("--out", type=Path, help="folder to make, or to go on with (default: NAME)")
+    command.add_argument("--out", type=Path, help="output folder; an existing one is continued (default: NAME)")
 
 
 def _experiment(options: argparse.Namespace) -> Answer:

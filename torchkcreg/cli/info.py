@@ -1,4 +1,4 @@
-"""The command `torchkcreg info`."""
+"""`torchkcreg info`: describe files, run folders or the installation."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from .command import add_command
 
 
 def add_info(commands) -> None:
-    command = add_command(commands, "info", _info, "say what a file or a run folder holds, or what is installed")
-    command.add_argument("paths", type=Path, nargs="*", help="meshes, geometries, projections, run folders")
-    command.add_argument("--open-beam", type=float, help="unattenuated intensity, where projections do not say it")
-    drawn = "figure to write of a geometry: focal spots and detectors in three dimensions (PNG, PDF, SVG)"
-    command.add_argument("--picture", type=Path, help=drawn)
+    """Add the flags of `torchkcreg info`."""
+    command = add_command(commands, "info", _info, "describe files and run folders; without paths, the installation")
+    command.add_argument("paths", type=Path, nargs="*", help="meshes, geometries, projections, run folders, ...")
+    command.add_argument(
+        "--open-beam", type=float, help="unattenuated intensity of projections, if their file does not give it"
+    )
+    picture = "write a 3D figure of a geometry's focal spots and detectors (PNG, PDF, SVG)"
+    command.add_argument("--picture", type=Path, help=picture)
 
 
 def _info(options: argparse.Namespace) -> Answer:
@@ -23,8 +26,10 @@ def _info(options: argparse.Namespace) -> Answer:
 
     if options.picture is not None:
         picture_geometry(options.paths, options.picture)
-    told = {str(path): describe(path, open_beam=options.open_beam) for path in options.paths}
-    texts = list(told.values()) or [describe_installation()]
+    descriptions = {str(path): describe(path, open_beam=options.open_beam) for path in options.paths}
+    texts = list(descriptions.values()) or [describe_installation()]
     if compared := runs_compared(options.paths):
         texts.append(compared)
-    return Answer("\n".join(texts), {"files": told} if told else {"installation": texts[0].splitlines()})
+    return Answer(
+        "\n".join(texts), {"files": descriptions} if descriptions else {"installation": texts[0].splitlines()}
+    )

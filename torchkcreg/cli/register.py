@@ -1,4 +1,4 @@
-"""The command ``torchkcreg register``."""
+"""`torchkcreg register`: measure the pose and deformation of an implant."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ FAILED = 3  # exit status
 
 
 def add_register(commands) -> None:
-    command = add_command(commands, "register", _register, "measure the deformation of an implant in a few projections")
-    mesh = "closed mesh of the undeformed implant (mm); repeated, with --components, --init and --material, for several"
+    """Add the flags of `torchkcreg register`."""
+    command = add_command(
+        commands, "register", _register, "measure the pose and deformation of an implant from a few X-ray views"
+    )
+    mesh = "closed mesh of the undeformed implant (mm); for several implants, repeat it, --components, --init, ..."
     command.add_argument("--implant", type=Path, action="append", required=True, help=mesh)
     command.add_argument(
         "--geometry", type=Path, required=True, help="projection matrices (JSON, XML, NPY, CSV, DICOM)"
@@ -26,35 +29,37 @@ def add_register(commands) -> None:
         required=True,
         help="intensities or line integrals (NPZ, MHA, TIFF, a folder, YAML, ...)",
     )
-    command.add_argument("--out", type=Path, required=True, help="run folder to make")
+    command.add_argument("--out", type=Path, required=True, help="run folder to write")
     command.add_argument("--views", type=_integers, help="views to use, such as 15,16,17 (default: all)")
-    steel = "material of the implant, such as steel: polyenergetic DRRs"
+    steel = "material of the implant, such as steel: makes DRRs polyenergetic; always give it"
     command.add_argument("--material", action="append", help=steel)
     command.add_argument("--spectrum", type=Path, help="detected spectrum: energy in keV, weight (CSV)")
-    screws = "screws that move with the implant (JSON); - for none of one of several"
+    screws = "screws that move with the implant (JSON); with several implants, - if this one has none"
     command.add_argument("--components", type=_path_or_none, action="append", help=screws)
-    start = "approximate implant_to_world (JSON), or the run folder of an earlier registration, such as without load"
+    start = "start pose: implant_to_world (JSON), or the run folder of an earlier registration, such as without load"
     command.add_argument("--init", type=_path_or_none, action="append", help=start)
-    rest = "run folder of a registration without load: finite elements bend the implant from that shape"
+    rest = "run folder of a registration without load: its shape is the rest shape of the finite elements"
     command.add_argument("--rest", type=_path_or_none, action="append", help=rest)
-    command.add_argument("--open-beam", type=float, help="unattenuated intensity, where the file does not say it")
+    command.add_argument("--open-beam", type=float, help="unattenuated intensity, if the file does not give it")
     command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
-    command.add_argument("--preset", help="schedule: gauss-newton, paper (CMA-ES) or adam")
+    command.add_argument("--preset", help="optimization schedule: gauss-newton, paper (CMA-ES) or adam")
     command.add_argument(
         "--deformation",
-        help="how it bends: modes (elastic modes, default), fe (loads at its holes), ffd (the paper's), auto",
+        help="deformation model: modes (elastic modes, default), fe (loads at the holes), ffd (the paper's), auto",
     )
-    command.add_argument("--pitch", type=float, dest="pitch_mm", help="pitch of the implant's nodes, mm")
-    command.add_argument("--seed", type=int, help="seed of the random numbers")
-    command.add_argument("--seeds", type=int, metavar="N", help="run N seeds, keep the best, report their spread")
+    command.add_argument("--pitch", type=float, dest="pitch_mm", help="spacing of the implant's nodes, mm")
+    command.add_argument("--seed", type=int, help="random seed")
+    command.add_argument(
+        "--seeds", type=int, metavar="N", help="register with N seeds, keep the best, report the spread"
+    )
     command.add_argument("--backend", help="projector: auto, cpp, triton or torch")
-    command.add_argument("--device", help="where it is computed: cpu (default), cuda, cuda:1, ...")
-    dry = "read and check everything, say and draw where the implant lies at the start (OUT-start.png), and stop"
+    command.add_argument("--device", help="PyTorch device: cpu (default), cuda, cuda:1, ...")
+    dry = "read and check all inputs, report and draw the start pose (OUT-start.png), then stop"
     command.add_argument("--dry-run", action="store_true", help=dry)
-    command.add_argument("--no-figures", action="store_true", help="leave the pictures out")
+    command.add_argument("--no-figures", action="store_true", help="do not draw figures")
     existing = command.add_mutually_exclusive_group()
-    existing.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
-    existing.add_argument("--resume", action="store_true", help="continue the run that the folder holds")
+    existing.add_argument("--overwrite", action="store_true", help="replace an existing run in the folder")
+    existing.add_argument("--resume", action="store_true", help="continue the run in the folder")
 
 
 def _path_or_none(text: str) -> Path | None:
@@ -62,7 +67,7 @@ def _path_or_none(text: str) -> Path | None:
 
 
 def _only(values: list | None) -> Any:
-    """The one of a repeatable flag that was given once; a list where it was repeated."""
+    """Value of a repeatable flag: a single value if it was given once, else the list."""
     return values[0] if values is not None and len(values) == 1 else values
 
 
@@ -78,10 +83,10 @@ def _register(options: argparse.Namespace) -> Answer:
 
     if options.seeds is not None and options.resume:
         raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")
-    named = ("geometry", "projections", "spectrum", "views", "open_beam", "config")
-    each = {name: _only(getattr(options, name)) for name in ("implant", "components", "init", "rest")}
+    single = ("geometry", "projections", "spectrum", "views", "open_beam", "config")
+    per_implant = {name: _only(getattr(options, name)) for name in ("implant", "components", "init", "rest")}
     materials = options.material if options.material and len(options.material) > 1 else None
-    files = RegistrationFiles(**each, materials=materials, **{name: getattr(options, name) for name in named})
+    files = RegistrationFiles(**per_implant, materials=materials, **{name: getattr(options, name) for name in single})
     names = ("preset", "deformation", "pitch_mm", "seed", "backend", "device")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     overrides |= {"material": options.material[0]} if options.material else {}
@@ -89,15 +94,15 @@ def _register(options: argparse.Namespace) -> Answer:
         picture = None if options.no_figures else options.out.with_name(f"{options.out.name}-start.png")
         lines = dry_run(files, picture, overrides=overrides)
         return Answer("\n".join(lines), {"said": lines, "picture": picture})
-    said = ""
-    how = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}
+    summary = ""
+    settings = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}
     if options.seeds is not None:
-        runs = register_seeds(files, options.out, options.seeds, **how)
+        runs = register_seeds(files, options.out, options.seeds, **settings)
         result = runs.result
-        said = f"{runs}\n"
+        summary = f"{runs}\n"
     else:
-        result = register_files(files, options.out, resume=options.resume, **how)
+        result = register_files(files, options.out, resume=options.resume, **settings)
     similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())
-    said += f"{result.status}: gradient correlation of each view {similarity}; run folder {options.out}"
+    summary += f"{result.status}: gradient correlation of each view {similarity}; run folder {options.out}"
     data = {"folder": options.out, "status": result.status, "reasons": result.warnings, "gc": result.gc.tolist()}
-    return Answer(said, data, FAILED if result.status == "failed" else 0)
+    return Answer(summary, data, FAILED if result.status == "failed" else 0)

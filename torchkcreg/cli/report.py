@@ -1,4 +1,4 @@
-"""``torchkcreg report``: a folder of results as one page."""
+"""`torchkcreg report`: results folder as one HTML page."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from .command import add_command
 
 
 def add_report(commands) -> None:
-    """Adds the command."""
-    text = "write a folder of results as one HTML page: verdict, numbers, pictures, the implant in 3D"
+    """Add the flags of `torchkcreg report`."""
+    text = "write a results folder as one HTML page: verdict, numbers, figures, the implant in 3D"
     command = add_command(commands, "report", _report, text)
-    command.add_argument("folder", type=Path, help="of a registration, a comparison or a reconstruction")
+    command.add_argument("folder", type=Path, help="folder of a registration, a comparison or a reconstruction")
     command.add_argument("--out", type=Path, help="page to write (default: FOLDER/report.html)")
 
 

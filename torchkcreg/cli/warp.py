@@ -1,4 +1,4 @@
-"""The command `torchkcreg warp`."""
+"""`torchkcreg warp`: map points from the undeformed implant's frame to the world."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from .command import add_command
 
 
 def add_warp(commands) -> None:
-    command = add_command(commands, "warp", _warp, "move points of the undeformed implant's frame to the world")
+    """Add the flags of `torchkcreg warp`."""
+    command = add_command(commands, "warp", _warp, "map points from the undeformed implant's frame to the world")
     command.add_argument("--run", type=Path, required=True, help="folder of a finished registration", dest="run_folder")
     command.add_argument("--points", type=Path, required=True, help="x,y,z in the implant's frame, mm (CSV)")
     command.add_argument(
-        "--out", type=Path, required=True, help="CSV to write: x,y,z in the world, outside or not, deviations"
+        "--out", type=Path, required=True, help="CSV file to write: x,y,z in the world, outside flag, expected errors"
     )
-    command.add_argument("--implant-name", help="of several implants, the one whose frame the points are in (its file)")
+    command.add_argument(
+        "--implant-name", help="which implant the points belong to, if the run has several (name of its mesh file)"
+    )
 
 
 def _warp(options: argparse.Namespace) -> Answer:

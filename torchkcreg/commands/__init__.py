@@ -1,4 +1,4 @@
-"""The work of each command, from files to a folder of results: one file a command, under its name."""
+"""Functions behind the commands: from input files to a folder of results. One module per command, of the same name."""
 
 from .compare import Comparison, compare_files
 from .convert import convert

@@ -1,4 +1,4 @@
-"""How an implant and the fragments that it holds moved between registrations, out of their run folders."""
+"""Relative motion of a fracture's fragments between registrations, from their run folders."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _COLUMNS = tuple(
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Motions of the upper fragment against the lower one, from an unloaded registration to loaded ones.
+    """Motion of the upper fragment relative to the lower one, from an unloaded registration to loaded ones.
 
     Attributes:
-        names: Of the loaded runs.
-        motions: In each.
-        loads: N; empty where nobody said.
-        compliance: By how much rotations (degrees) and translations (mm), (6,), grow with a newton; None without loads.
-        compliance_std: Standard deviations.
-        warnings: Why they may not be so.
-        folder: Where the files are.
+        names: Folders of the loaded runs.
+        motions: Motion in each loaded run.
+        loads: Load of each loaded run, N; empty if not given.
+        compliance: Rotations (degrees) and translations (mm) per newton (6,); None without loads.
+        compliance_std: Standard deviations of the compliance (6,).
+        warnings: Reasons to doubt the motions.
+        folder: Output folder.
     """
 
     names: tuple[str, ...]
@@ -52,7 +52,7 @@ class Comparison:
     folder: Path
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types and tensors, with units in their names."""
+        """Dictionary of plain types and tensors, with units in the keys."""
         runs = [{"run": name, **motion.to_dict()} for name, motion in zip(self.names, self.motions, strict=True)]
         for run, load in zip(runs, self.loads):
             run["load_n"] = load
@@ -63,7 +63,7 @@ class Comparison:
         return content
 
     def table(self) -> str:
-        """A row a run, as CSV."""
+        """CSV table with a row per loaded run."""
         heads = ["run", *(["load_n"] if self.loads else [])]
         heads += [column for name in _COLUMNS for column in (name, "_std_".join(name.rsplit("_", 1)))]
         lines = [",".join(heads)]
@@ -94,20 +94,20 @@ def compare_files(
     name: str | None = None,
     figures: bool = True,
 ) -> Comparison:
-    """Motion of a fracture's fragments from an unloaded registration to loaded ones; writes JSON, CSV and a figure.
+    """Measure how a fracture's fragments move under load between registrations; write JSON, CSV and a figure.
 
     Args:
-        unloaded: Run folder of the first registration.
-        loaded: Run folders of the others; their implants may lie in other CAD frames.
-        out: Folder for `compare.json`, `compare.csv` and `compare.png`; it is made.
-        loads: N, one a loaded run.
-        plane: Point, and perhaps normal, of the fracture in the first run's frame of the implant, 3 or 6 numbers.
-        fragment: Surface of one fragment in that frame.
-        name: Of several implants, which.
-        figures: Whether to draw.
+        unloaded: Run folder of the registration without load.
+        loaded: Run folders of the registrations under load; their meshes may be in other CAD frames.
+        out: Folder for `compare.json`, `compare.csv` and `compare.png`, created if missing.
+        loads: Load of each loaded run, N.
+        plane: Fracture plane in the implant's frame of the unloaded run: point, or point and normal (3 or 6 numbers).
+        fragment: Surface mesh of one fragment in that frame.
+        name: Name of the implant, if the runs have several.
+        figures: Draw figure and report.
 
     Raises:
-        ValueError: If runs are of different implants, or fragments cannot be told.
+        ValueError: If runs are of different implants, or the fragments cannot be determined.
         FileNotFoundError: If a file is missing.
     """
     if not loaded:
@@ -116,56 +116,56 @@ def compare_files(
         raise ValueError(f"{len(loaded)} loaded runs need as many loads, got {len(loads)}")
     if plane is not None and len(plane) not in (3, 6):
         raise ValueError(f"a plane is a point, or a point and a normal: 3 or 6 numbers, got {len(plane)}")
-    first, mesh, said = _implant(unloaded, name)
+    first, mesh, doubts = _implant(unloaded, name)
     cloud = ImplantPointCloud.from_mesh(mesh, _PITCH_MM, dtype=torch.float64)
-    place = None
+    fracture = None
     if plane is not None:
         numbers = torch.tensor(list(plane), dtype=torch.float64)
-        place = numbers[:3], numbers[3:] if len(plane) == 6 else None
+        fracture = numbers[:3], numbers[3:] if len(plane) == 6 else None
     fragments = fragments_of(
         cloud.points,
         first.screws,
         radius_mm=first.follow_radius_mm,
-        plane=place,
+        plane=fracture,
         mesh=None if fragment is None else read_mesh(fragment),
     )
-    warnings, motions = list(said), []
+    warnings, motions = list(doubts), []
     if not first.screws:
-        warnings.append("no screws tell what is fixed to which fragment: the ends of the implant stand for them")
+        warnings.append("no screws show what is fixed to which fragment: the ends of the implant are used instead")
     for folder in loaded:
-        second, other, said = _implant(folder, name)
-        warnings += said
-        change = _nearest(frame_changes(mesh, other), first, second, cloud.points)
+        second, second_mesh, doubts = _implant(folder, name)
+        warnings += doubts
+        change = _nearest(frame_changes(mesh, second_mesh), first, second, cloud.points)
         motions.append(relative_motion(first, second, cloud, fragments, to_second=change))
     compliance, std = _slopes(motions, loads) if loads else (None, None)
     names = tuple(str(folder) for folder in loaded)
-    found = Comparison(names, tuple(motions), tuple(loads), compliance, std, tuple(warnings), out)
+    comparison = Comparison(names, tuple(motions), tuple(loads), compliance, std, tuple(warnings), out)
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "compare.json", plain(found.to_dict()))
-    write_text(out / "compare.csv", found.table())
+    write_json(out / "compare.json", plain(comparison.to_dict()))
+    write_text(out / "compare.csv", comparison.table())
     if figures:
         write_figure(out / "compare.png", comparison_figure(motions, [Path(n).name for n in names], loads))
         write_report(out)
-    return found
+    return comparison
 
 
 def _implant(folder: Path, name: str | None):
     result, implant = implant_of_run(folder, name)
-    said = [f"{folder} is {result.status}: {why}" for why in result.warnings if result.status != "ok"]
+    doubts = [f"{folder} is {result.status}: {why}" for why in result.warnings if result.status != "ok"]
     if implant.deviations is None:
-        said.append(f"{folder} was written before registrations kept their deviations: there are no error bars")
-    return implant, read_mesh(mesh_of_run(folder, result.implants.index(implant))), said
+        doubts.append(f"{folder} comes from a version that did not store expected errors: there are no error bars")
+    return implant, read_mesh(mesh_of_run(folder, result.implants.index(implant))), doubts
 
 
 def _nearest(changes: Sequence[Tensor], first: RegisteredImplant, second: RegisteredImplant, points: Tensor) -> Tensor:
-    """Of several ways to lay a symmetric implant onto itself the one by which it has moved least."""
-    here = first.warp(points.double())
-    away = [float((second.warp(transform_points(c, points.double())) - here).square().mean()) for c in changes]
-    return changes[int(np.argmin(away))]
+    """Frame change with the smallest motion; a symmetric implant has several that map it onto itself."""
+    unloaded = first.warp(points.double())
+    distances = [float((second.warp(transform_points(c, points.double())) - unloaded).square().mean()) for c in changes]
+    return changes[int(np.argmin(distances))]
 
 
 def _slopes(motions: Sequence[RelativeMotion], loads: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Slopes (6,) over the load, through the origin, and their standard deviations."""
+    """Weighted slopes (6,) of motion over load, through the origin, and their standard deviations."""
     values, std = (torch.stack(parts) for parts in zip(*(motion.numbers for motion in motions), strict=True))
     force = torch.tensor(list(loads), dtype=torch.float64)[:, None]
     weights = 1 / std.square().clamp_min(1e-12)

@@ -1,4 +1,4 @@
-"""Files of one format into another: geometries, meshes, projections."""
+"""Convert geometries, meshes and projections between file formats."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ def convert(
     open_beam: float | None = None,
     overwrite: bool = False,
 ) -> str:
-    """Writes what one file holds to another, whose ending says the format; returns what was done, for people.
+    """Convert a file to the format given by the target's suffix; return a one-line summary.
 
-    A target that ends as a mesh takes the source for one, a target that ends as an image (MHA, NRRD, NIfTI) takes it
-    for projections and holds their line integrals, NaN where a pixel does not count; all others are geometries.
+    If the target is a mesh, the source is read as a mesh. If the target is an image (MHA, NRRD, NIfTI), the source is
+    read as projections, and their line integrals are written, with NaN in masked pixels. Otherwise both are geometries.
 
     Args:
-        source: see `read_geometry`, `read_mesh`, `read_projections`.
+        source: See `read_geometry`, `read_mesh`, `read_projections`.
         target: JSON, XML, NPY, NPZ, CSV or TXT; STL, OBJ, PLY or OFF; MHA, NRRD or NIfTI.
-        projections: image whose header says what a geometry's pixels are.
-        det_shape: (rows, cols), where no header says it.
-        pixel_spacing: (dv, du) in mm, or one number for both; also of the images that are written.
-        layout: of twelve numbers a view, read or written.
-        gantry_axis: of the source's world; where it is not z, the world is turned, `gantry_about_z`.
-        open_beam: of projections, where their file does not say it.
-        overwrite: replace the target.
+        projections: Image whose header gives number and size of a geometry's pixels.
+        det_shape: Detector size (rows, cols), if no header gives it.
+        pixel_spacing: (dv, du) in mm, or one number for both; also used for images that are written.
+        layout: Meaning of twelve numbers per view, read or written: "matrices" or "astra".
+        gantry_axis: Rotation axis in the source's world; if it is not z, the world is rotated (`gantry_about_z`).
+        open_beam: Unattenuated intensity of projections, if their file does not give it.
+        overwrite: Replace the target if it exists.
 
     Raises:
-        FileExistsError: the target is there.
-        ValueError: see the readers; or more than two pixel pitches.
+        FileExistsError: If the target exists.
+        ValueError: If a file cannot be read, or more than two pixel pitches are given.
     """
     if target.exists() and not overwrite:
         raise FileExistsError(f"{target} is there already: name another file, or overwrite it")
@@ -64,11 +64,11 @@ def convert(
         write_mesh(target, mesh)
         return f"{len(mesh.faces)} triangles, {' x '.join(f'{size:.4g}' for size in mesh.extents)} mm: {target}"
     if target.name.lower().endswith(IMAGE_SUFFIXES):
-        found = read_projections(source, open_beam=open_beam)
-        lines = torch.where(found.mask, found.line_integrals, torch.nan)
-        write_stack(target, lines, spacing or (found.header.spacing if found.header else None))
-        left = f"; {note}" if (note := found.masked_note()) else ""
-        return f"line integrals of {len(lines)} views of {lines.shape[1]} x {lines.shape[2]} pixels: {target}{left}"
+        stack = read_projections(source, open_beam=open_beam)
+        lines = torch.where(stack.mask, stack.line_integrals, torch.nan)
+        write_stack(target, lines, spacing or (stack.header.spacing if stack.header else None))
+        masked = f"; {note}" if (note := stack.masked_note()) else ""
+        return f"line integrals of {len(lines)} views of {lines.shape[1]} x {lines.shape[2]} pixels: {target}{masked}"
     if target.suffix.lower() not in GEOMETRY_SUFFIXES or source.name.lower().endswith(IMAGE_SUFFIXES):
         kinds = (("geometries", GEOMETRY_SUFFIXES), ("meshes", WRITTEN_SUFFIXES), ("line integrals", IMAGE_SUFFIXES))
         known = "; ".join(f"{what} as {', '.join(suffixes)}" for what, suffixes in kinds)

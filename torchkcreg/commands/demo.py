@@ -1,4 +1,4 @@
-"""The demo: simulate a plate under load, register it as one would a patient's, and compare with the truth."""
+"""The demo: simulate a plate under load, register it like a patient's, and compare with the truth."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ VIEWS = (47, 48, 49)
 
 
 def demo(out: Path, *, seed: int = 0, overwrite: bool = False) -> dict[str, PointMetrics]:
-    """Errors of the demo's registration at the beads and at the plate's nodes, before and after.
+    """Run the demo and return its errors at the beads and the plate's nodes, at the start pose and after registration.
 
     A plate with screws, bone and beads is bent by about 5 mm at its end, imaged in three neighbouring views with a
-    polyenergetic beam, scatter, blur and noise, and registered. The model does not share the images' spectrum, scatter,
-    blur, bone or projector: it is told the screws and a spectrum of a lower tube voltage. The registered plate is then
-    compared with the true one. The files of both halves, simulated case and run, are left in ``out``.
+    polyenergetic beam, scatter, blur and noise, and registered. The registration does not use the spectrum, scatter,
+    blur, bone or projector of the simulation: it gets the screws and a spectrum of a lower tube voltage. The registered
+    plate is then compared with the true one. The simulated case and the run stay in `out`.
 
     Args:
-        out: Folder to make, with ``case/``, ``run/`` and ``evaluation.json``.
+        out: Output folder, with `case/`, `run/` and `evaluation.json`.
         seed: Seed of the load's direction, the noise and the optimiser.
-        overwrite: Replace the demo that the folder holds.
+        overwrite: Replace an existing demo in the folder.
 
     Returns:
-        "beads at the start", "beads", "plate at the start", "plate".
+        Errors under "beads at the start", "beads", "plate at the start" and "plate".
 
     Raises:
-        FileExistsError: If the folder holds something else, or a demo that is not to be replaced.
+        FileExistsError: If the folder holds other files, or a demo and `overwrite` is False.
     """
     out, start = Path(out), time.perf_counter()
     _check_folder(out, overwrite)
@@ -58,7 +58,7 @@ def demo(out: Path, *, seed: int = 0, overwrite: bool = False) -> dict[str, Poin
     case = weight_bearing_case(1.0, seed=seed, views=VIEWS, kvp=SIMULATED_KVP)
     files = _write_case(out / CASE, case)
     print(
-        f"Registering it. The model is told the screws, but {ASSUMED_KVP} kV, and nothing of bone and scatter ...",
+        f"Registering it with known screws, but {ASSUMED_KVP} kV and without bone and scatter ...",
         flush=True,
     )
     overrides = {"material": case.implant_material, "seed": seed}
@@ -69,7 +69,7 @@ def demo(out: Path, *, seed: int = 0, overwrite: bool = False) -> dict[str, Poin
     print(f"{time.perf_counter() - start:.0f} s. Pictures:")
     for picture in ("overlay", "displacement", "history"):
         print(f"  {out / RUN / picture}.png")
-    print(f"All of it on one page: {out / RUN / REPORT}")
+    print(f"Report with everything: {out / RUN / REPORT}")
     return metrics
 
 
@@ -77,14 +77,14 @@ def _check_folder(out: Path, overwrite: bool) -> None:
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(f"demo folder {out} cannot be made: a file is in the way")
     entries = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
-    if other := sorted(entries - {CASE, RUN, EVALUATION}):
-        raise FileExistsError(f"folder {out} holds more than a demo ({other[0]}): choose another one")
+    if foreign := sorted(entries - {CASE, RUN, EVALUATION}):
+        raise FileExistsError(f"folder {out} holds more than a demo ({foreign[0]}): choose another one")
     if entries and not overwrite:
         raise FileExistsError(f"folder {out} holds a demo already: replace it with --overwrite or choose another one")
 
 
 def _write_case(folder: Path, case: SimulatedCase) -> RegistrationFiles:
-    """Files that a registration reads, and the beads' positions, of a simulated case."""
+    """Write the input files of a registration and the beads' positions; return the files."""
     folder.mkdir(parents=True, exist_ok=True)
     mesh = folder / "implant.stl"
     files = RegistrationFiles(
@@ -105,7 +105,7 @@ def _write_case(folder: Path, case: SimulatedCase) -> RegistrationFiles:
 
 
 def _evaluate(case: SimulatedCase, result: RegistrationResult) -> tuple[dict[str, PointMetrics], str]:
-    """Errors before and after, and a table of them for people."""
+    """Errors before and after registration, and a table of them as text."""
     nodes = ImplantPointCloud.from_mesh(case.implant, pitch=1.0, dtype=torch.float64).points
     beads, true_beads, true_nodes = case.beads_before, case.beads_after, case.deform(nodes)
     metrics = {

@@ -1,4 +1,4 @@
-"""Bone mineral near an implant, from the folder of a reconstruction."""
+"""Bone mineral density near an implant, from the folder of a reconstruction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchkcreg.io import read_json, read_volume, write_figure, write_json
 from torchkcreg.physics import calcium_of
 from torchkcreg.visualization import reconstruction_figure
 
-_METAL = 0.05  # of the largest attenuation that the implant adds: what voxels are metal
+_METAL = 0.05  # a voxel is metal if the implant adds more than this fraction of its largest added attenuation
 
 
 def densitometry_files(
@@ -26,18 +26,18 @@ def densitometry_files(
     from_metal_mm: float = 1.5,
     figures: bool = True,
 ) -> list[MineralContent]:
-    """Calcium in regions of a reconstruction; ``densitometry.json`` and ``densitometry.png`` are written to ``out``.
+    """Measure calcium in regions of a reconstruction; write `densitometry.json` and `densitometry.png` to `out`.
 
     Args:
-        reconstruction: Folder that `reconstruct` made, of any method; ``kcrec`` knows the metal best.
-        out: Folder to make, or to add to.
-        cylinders: Regions of seven numbers each: both ends of the axis (x, y, z) and the radius, mm.
-        labels: Label map on the reconstruction's voxels, such as a segmentation: each number above zero is a region.
-        from_metal_mm: Voxels nearer to metal than this don't count.
+        reconstruction: Folder of a reconstruction by any method; the metal is most accurate with `kcrec`.
+        out: Output folder, created if missing.
+        cylinders: Cylindrical regions, seven numbers each: both ends of the axis (x, y, z) and the radius, mm.
+        labels: Label map on the reconstruction's voxels, such as a segmentation: each label above zero is a region.
+        from_metal_mm: Voxels closer to metal than this are ignored.
         figures: Draw the regions.
 
     Raises:
-        ValueError: If no region is given, one doesn't fit, or the reconstruction has no energy to refer to.
+        ValueError: If no region is given, a region does not fit, or the reconstruction has no reference energy.
         FileNotFoundError: If a file is missing.
     """
     volume, grid = read_volume(reconstruction / "volume.mha")
@@ -53,13 +53,13 @@ def densitometry_files(
     metal = _metal(reconstruction, volume)
     usable = distance_to(metal, grid) >= max(from_metal_mm, 1e-9)
     calcium = calcium_of(volume, float(energy))
-    found = mineral_content(calcium, regions, grid, usable=usable)
+    contents = mineral_content(calcium, regions, grid, usable=usable)
     out.mkdir(parents=True, exist_ok=True)
     record = {
         "units": {"calcium": "mg/mL", "hydroxyapatite": "mg/mL", "content": "mg of hydroxyapatite", "volume": "mL"},
         "reference_kev": energy,
         "from_metal_mm": from_metal_mm,
-        "regions": [_record(one) for one in found],
+        "regions": [_record(content) for content in contents],
     }
     write_json(out / "densitometry.json", record)
     if figures:
@@ -74,15 +74,15 @@ def densitometry_files(
             unit="mg/mL",
         )
         write_figure(out / "densitometry.png", figure)
-    return found
+    return contents
 
 
-def _record(one: MineralContent) -> dict[str, float | str | int]:
-    return {**vars(one), "hydroxyapatite_mg_ml": one.hydroxyapatite_mg_ml, "content_mg": one.content_mg}
+def _record(content: MineralContent) -> dict[str, float | str | int]:
+    return {**vars(content), "hydroxyapatite_mg_ml": content.hydroxyapatite_mg_ml, "content_mg": content.content_mg}
 
 
 def _metal(reconstruction: Path, volume: Tensor) -> Tensor:
-    """Voxels with metal (D, H, W); none where the reconstruction knew of none."""
+    """Mask of metal voxels (D, H, W); all False if the reconstruction had no known metal."""
     path = reconstruction / "with_implant.mha"
     if not path.exists():
         return torch.zeros_like(volume, dtype=torch.bool)
@@ -92,10 +92,10 @@ def _metal(reconstruction: Path, volume: Tensor) -> Tensor:
 
 def _cylinders(cylinders: Sequence[Sequence[float]], grid: VolumeGrid) -> dict[str, Tensor]:
     regions = {}
-    for number, one in enumerate(cylinders, 1):
-        if len(one) != 7:
-            raise ValueError(f"a cylinder is seven numbers, two ends (x, y, z) and a radius, got {len(one)}")
-        regions[f"cylinder {number}"] = cylinder_region(grid, one[:3], one[3:6], one[6])
+    for number, cylinder in enumerate(cylinders, 1):
+        if len(cylinder) != 7:
+            raise ValueError(f"a cylinder is seven numbers, two ends (x, y, z) and a radius, got {len(cylinder)}")
+        regions[f"cylinder {number}"] = cylinder_region(grid, cylinder[:3], cylinder[3:6], cylinder[6])
     return regions
 
 

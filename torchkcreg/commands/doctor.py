@@ -1,4 +1,4 @@
-"""Whether an installation works: what is built, and a self-test of some seconds against references and known truths."""
+"""Check of the installation: compiled kernels, threads, and a self-test of a few seconds with known results."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from torchkcreg.simulation import weight_bearing_case
 from .info import describe_installation, kernels_in_words
 
 GEOMETRY = circular_geometry(range(0, 360, 12), sad=404, sdd=538, det_shape=(24, 32), pixel_spacing=(3.0, 3.0))
-ROUNDING = 1e-4  # of the largest value: single precision, and a margin
-ROUGH_MM = 0.2  # a quick registration of a small case is much better than this
+ROUNDING = 1e-4  # relative to the largest value: single precision with a margin
+ROUGH_MM = 0.2  # largest accepted error; a quick registration of a small case is much better
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        name: what.
-        passed: whether it works.
-        found: a figure, or the reason.
+        name: Name of the check.
+        passed: True if it works.
+        found: A figure, or the reason of a failure.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Check:
 
 
 def self_test() -> list[Check]:
-    """Runs every check; one that raises has failed, with the error as what was found."""
+    """Run every check. A check that raises has failed, and its error is reported."""
     checks: dict[str, Callable[[], tuple[bool, str]]] = {
         "kernels": _kernels,
         "threads": _threads,
@@ -54,18 +54,18 @@ def self_test() -> list[Check]:
         "FDK of a ball": _fdk,
         "registration of a small case": _registration,
     }
-    found = []
+    results = []
     for name, check in checks.items():
         try:
             passed, text = check()
-        except Exception as error:  # whatever it is, it is what the user came to see
+        except Exception as error:  # any error is a finding to report
             passed, text = False, f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
-        found.append(Check(name, passed, text))
-    return found
+        results.append(Check(name, passed, text))
+    return results
 
 
 def doctor() -> tuple[str, bool]:
-    """Versions, backend and the self-test, a line each; and whether all is well."""
+    """Report of versions, backend and self-test, a line each, and True if every check passed."""
     checks = self_test()
     healthy = all(check.passed for check in checks)
     last = "all is well" if healthy else "something does not work: see FAIL above"
@@ -80,8 +80,8 @@ def _kernels() -> tuple[bool, str]:
 def _threads() -> tuple[bool, str]:
     threads, cores = torch.get_num_threads(), os.cpu_count() or 1
     limited = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if name in os.environ}
-    told = "".join(f", {name}={value}" for name, value in limited.items())
-    return threads >= 1, f"{threads} of {cores} cores{told}"
+    settings = "".join(f", {name}={value}" for name, value in limited.items())
+    return threads >= 1, f"{threads} of {cores} cores{settings}"
 
 
 def _nodes() -> tuple[bool, str]:
@@ -101,14 +101,14 @@ def _voxels() -> tuple[bool, str]:
     volume = torch.rand(grid.shape, generator=generator)
     images = project_volume(volume, grid, GEOMETRY.projection_matrices, (24, 32))
     weights = torch.rand(images.shape, generator=generator)
-    one = (images * weights).sum(dtype=torch.float64)
-    other = (volume * backproject(weights, grid, GEOMETRY.projection_matrices)).sum(dtype=torch.float64)
-    return _alike(one, other, "between projector and adjoint")
+    forward = (images * weights).sum(dtype=torch.float64)
+    adjoint = (volume * backproject(weights, grid, GEOMETRY.projection_matrices)).sum(dtype=torch.float64)
+    return _alike(forward, adjoint, "between projector and adjoint")
 
 
-def _alike(one: torch.Tensor, other: torch.Tensor, what: str) -> tuple[bool, str]:
-    error = float((one - other).abs().max() / other.abs().max())
-    return error < ROUNDING, f"{error:.1e} {what}"
+def _alike(values: torch.Tensor, reference: torch.Tensor, label: str) -> tuple[bool, str]:
+    error = float((values - reference).abs().max() / reference.abs().max())
+    return error < ROUNDING, f"{error:.1e} {label}"
 
 
 def _fdk() -> tuple[bool, str]:
@@ -119,8 +119,8 @@ def _fdk() -> tuple[bool, str]:
     nearest = torch.linalg.cross(source.expand_as(ray), ray).norm(dim=-1)
     chords = 2 * (radius**2 - nearest**2).clamp_min(0).sqrt()
     volume = fdk(0.02 * chords.float(), GEOMETRY, grid)
-    found = float(volume[grid.points().norm(dim=-1) < 8].mean())
-    return abs(found - 0.02) < 0.001, f"{found:.4f} for 0.02 per mm"
+    mean = float(volume[grid.points().norm(dim=-1) < 8].mean())
+    return abs(mean - 0.02) < 0.001, f"{mean:.4f} for 0.02 per mm"
 
 
 def _registration() -> tuple[bool, str]:

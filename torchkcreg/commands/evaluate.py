@@ -1,4 +1,4 @@
-"""An evaluation from files: a run against known points, or against the true shape of the deformed implant."""
+"""Evaluate a run against known points, or against the true shape of the deformed implant."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _ENOUGH_FOR_A_MAP = 100  # points
 
 @dataclass(frozen=True, eq=False)
 class FileEvaluation:
-    """What a run was compared with.
+    """Errors of a run.
 
     Attributes:
-        points: errors at known points, where they were given.
-        shape: errors against the true shape, where that was given.
-        pictures: the figures that were written.
+        points: Errors at known points, if points were given.
+        shape: Errors against the true shape, if a reference was given.
+        pictures: Figure files that were written.
     """
 
     points: PointMetrics | None
@@ -45,7 +45,7 @@ class FileEvaluation:
     pictures: tuple[Path, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
-        """Plain data: the metrics of the points, and those of the shape under "shape"."""
+        """Dictionary of the point metrics, with the shape metrics under "shape"."""
         points = {} if self.points is None else self.points.to_dict()
         return points if self.shape is None else {**points, "shape": self.shape.to_dict()}
 
@@ -68,12 +68,13 @@ def evaluate_files(
 
     Args:
         run_folder: Folder of the registration.
-        points: Points before, in the implant's frame (CSV).
-        truth: Where they are after, in the world (CSV).
+        points: Points in the undeformed implant's frame (CSV).
+        truth: The same points in the world after deformation (CSV).
         reference: True shape of the deformed implant, see `torchkcreg.io.read_reference`.
-        reference_kind: What a reference's points are, "volume" or "surface"; found out when None.
-        implant: Mesh of the undeformed implant; the one that the run was started with when None.
-        figures: Folder for pictures: displacement map, and error maps and histograms of what was compared.
+        reference_kind: "volume" or "surface": whether the reference's points fill its volume or lie on its surface;
+            detected if None.
+        implant: Mesh of the undeformed implant; the run's mesh if None.
+        figures: Folder for figures: displacement map, error maps and histograms.
 
     Raises:
         ValueError: If there is nothing to compare with, or files do not fit.
@@ -135,10 +136,10 @@ def _displacement(result: RegistrationResult, mesh: trimesh.Trimesh) -> Figure:
 
 def _shape_figures(shape: ShapeEvaluation) -> dict[str, Figure]:
     name = "nodes" if shape.surface_after is None else "surface"
-    what = f"distance to the reference's {'surface' if name == 'surface' else 'nearest node'}"
+    label = f"distance to the reference's {'surface' if name == 'surface' else 'nearest node'}"
     if shape.reference == "surface":
-        what = "distance of the scanned points from the registered surface"
-    title, histogram_title = f"{what}, after rigid alignment", f"{what}, before and after rigid alignment"
+        label = "distance of the scanned points from the registered surface"
+    title, histogram_title = f"{label}, after rigid alignment", f"{label}, before and after rigid alignment"
     before, after = (getattr(shape, f"{name}_{when}") for when in ("before", "after"))
     distances, widths = {"after": shape.errors}, {"after": after.fwhm_mm}
     if shape.errors_before is not None:

@@ -1,4 +1,4 @@
-"""What a file or a folder holds, and what is installed, in a few lines for people."""
+"""Describe files, folders and the installation in a few lines; rank runs of the same images."""
 
 from __future__ import annotations
 
@@ -43,41 +43,45 @@ _STACKS = (".tif", ".tiff", ".png", ".h5", ".hdf5", ".hdf", ".nxs")
 
 
 def runs_compared(paths: Sequence[Path]) -> str:
-    """Lines that rank those of the paths that are run folders of the same images by Akaike's criterion, best first.
+    """Ranking of the run folders of the same images among the paths by Akaike's criterion, best first, as text.
 
-    ``n ln(misfit) + 2 p``: n is the number of blocks of pixels that say something, misfit what of the images' contrast
-    is left unexplained, p the number of parameters that the images determine (of which priors leave a part). Only
-    differences mean something; one of 10 is a clear one. Empty where there are fewer than two such runs.
+    The criterion is `n ln(misfit) + 2 p`: n is the number of informative pixel blocks, misfit the unexplained part of
+    the images' contrast, and p the effective number of parameters that the images determine (priors reduce it). Only
+    differences are meaningful; 10 is a clear difference. The text is empty if there are fewer than two such runs.
 
     Args:
-        paths: Run folders, and others, which are passed over.
+        paths: Run folders; other paths are skipped.
     """
-    runs = [(path, *told) for path in paths if (told := _told(path)) is not None]
+    runs = [(path, *run) for path in paths if (run := _told(path)) is not None]
     same = [run for run in runs if run[1] == runs[0][1]]
     if len(same) < 2:
         return ""
-    blocks = sum(found["blocks"] for *_, found in same) / len(same)
+    blocks = sum(diagnostics["blocks"] for *_, diagnostics in same) / len(same)
     ranked = sorted((blocks * math.log(f["misfit"]) + 2 * f["effective_parameters"], path, f) for path, _, f in same)
     lines = ["which explains the same images better (difference of Akaike's criterion):"]
-    for value, path, found in ranked:
-        words = f"misfit {found['misfit']:.4f} with {found['effective_parameters']:.1f} effective parameters"
+    for value, path, diagnostics in ranked:
+        words = (
+            f"misfit {diagnostics['misfit']:.4f} with {diagnostics['effective_parameters']:.1f} effective parameters"
+        )
         lines.append(f"  {path}: +{value - ranked[0][0]:.1f}, {words}")
     return "\n".join(lines)
 
 
 def _told(path: Path) -> tuple[dict[str, Any], dict[str, Any]] | None:
-    """The images of a finished run, and its diagnostics; None for anything else."""
+    """Image files of a finished run and its diagnostics; None for anything else."""
     if not ((path / "config.yaml").is_file() and (path / "metrics.json").is_file()):
         return None
     files = read_config(path / "config.yaml").get("files")
-    found = read_json(path / "metrics.json", "metrics").get("diagnostics", {})
-    if not isinstance(files, dict) or not all(found.get(key) for key in ("blocks", "misfit", "effective_parameters")):
+    diagnostics = read_json(path / "metrics.json", "metrics").get("diagnostics", {})
+    if not isinstance(files, dict) or not all(
+        diagnostics.get(key) for key in ("blocks", "misfit", "effective_parameters")
+    ):
         return None
-    return {name: files.get(name) for name in _IMAGES}, found
+    return {name: files.get(name) for name in _IMAGES}, diagnostics
 
 
 def describe_run(path: Path) -> str:
-    """A registration: its verdict, what was measured, and how long it took."""
+    """Description of a registration: verdict, measured motion, expected error and time."""
     run = RunFolder(path)
     result = run.read_result()
     metrics = read_json(path / "metrics.json", "metrics") if (path / "metrics.json").is_file() else {}
@@ -103,7 +107,7 @@ def _size(implant: RegisteredImplant) -> str:
     deformation = implant.deformation
     if isinstance(deformation, FiniteElementDeformation):
         element = deformation.superelement
-        return f"{implant.name}: elastic body held at {len(element.holds)} places, {element.num_amounts} ways to bend"
+        return f"{implant.name}: elastic body held at {len(element.holds)} places, {element.num_amounts} parameters"
     if not isinstance(deformation, FreeFormDeformation):
         return f"{implant.name}: {deformation.model} deformation"
     shape = " x ".join(str(n) for n in deformation.grid.shape)
@@ -112,14 +116,14 @@ def _size(implant: RegisteredImplant) -> str:
 
 
 def describe_installation() -> str:
-    """Versions, threads and the projector's backend with the reason for it, a line each."""
+    """Versions, threads and the projector's backend with its reason, a line each."""
     lines = [f"{name} {version}" for name, version in versions().items()]
     backend, why = kernels_in_words()
     return "\n".join([*lines, f"projector backend {backend} ({why})"])
 
 
 def kernels_in_words() -> tuple[str, str]:
-    """The projector's backend on a CPU, and why it is this one."""
+    """The projector's backend on the CPU, and the reason for it."""
     backend = choose_backend(torch.empty(0), "auto").name
     if backend != "cpp":
         return backend, f"the readable reference, slow; no C++ kernels: {unavailable_reason()}"
@@ -128,15 +132,15 @@ def kernels_in_words() -> tuple[str, str]:
 
 
 def describe(path: Path, *, open_beam: float | None = None) -> str:
-    """What a mesh, a geometry, projections, a table, a configuration, a volume or a folder of results holds.
+    """Description of a mesh, a geometry, projections, a table, a configuration, a volume or a folder of results.
 
     Args:
         path: A folder (a run, a reconstruction, a comparison, images), or a file of any kind that is read or written.
-        open_beam: Unattenuated intensity, where projections do not say it.
+        open_beam: Unattenuated intensity of projections, if their file does not give it.
 
     Raises:
-        FileNotFoundError: If nothing is there, or the run in the folder is not finished.
-        ValueError: If it cannot be read, or is none of these.
+        FileNotFoundError: If the path does not exist, or the run in the folder is not finished.
+        ValueError: If it cannot be read, or is of another kind.
     """
     path, projections = Path(path), partial(_projections, open_beam=open_beam)
     readers: dict[tuple[str, ...], list[Callable[[Path], str]]] = {
@@ -160,15 +164,15 @@ def describe(path: Path, *, open_beam: float | None = None) -> str:
             return f"{path}: {_first(path, candidates)}"
     known = ", ".join(suffix for suffixes in readers for suffix in suffixes)
     raise ValueError(
-        f"{path} is none of what can be described: a folder of results, DICOM, or a file ending in {known}"
+        f"{path} cannot be described: it is neither a folder of results, nor DICOM, nor a file ending in {known}"
     )
 
 
 def picture_geometry(paths: Sequence[Path], out: Path) -> None:
-    """Writes a figure of a geometry's focal spots and detectors.
+    """Write a figure of a geometry's focal spots and detectors.
 
     Raises:
-        ValueError: Not one file, or one that says too little.
+        ValueError: If there is not exactly one file, or it does not describe a complete geometry.
     """
     if len(paths) != 1:
         raise ValueError(f"a picture is of one geometry, got {len(paths)} files")
@@ -176,7 +180,7 @@ def picture_geometry(paths: Sequence[Path], out: Path) -> None:
 
 
 def _first(path: Path, candidates: list[Callable[[Path], str]]) -> str:
-    """What the first says that can read a file; what the last finds wrong with it if none can."""
+    """Description by the first reader that can read the file; if none can, the error of the last one."""
     for read in candidates[:-1]:
         with contextlib.suppress(ValueError):
             return read(path)

@@ -1,4 +1,4 @@
-"""What the implant of a registration carries, out of its run folder."""
+"""Loads and stresses of a registered implant, from its run folder."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _EDGE_MM = 1.5
 
 @dataclass(frozen=True, eq=False)
 class ImplantLoad:
-    """What an implant carries.
+    """Loads and stresses of an implant.
 
     Attributes:
-        carried: Loads at holds and through sections.
+        carried: Loads at its holds and through its cross-sections.
         stress: Largest von Mises stress on its surface, N/mm^2.
-        stress_std: Its standard deviation.
-        yield_stress: Where the alloy begins to stay bent.
-        warnings: Why it may not be so.
-        folder: Where the files are.
+        stress_std: Standard deviation of the largest stress, N/mm^2.
+        yield_stress: Yield stress of the alloy, N/mm^2.
+        warnings: Reasons to doubt the loads.
+        folder: Output folder.
     """
 
     carried: CarriedLoad
@@ -42,7 +42,7 @@ class ImplantLoad:
     folder: Path
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types and tensors, with units in their names."""
+        """Dictionary of plain types and tensors, with units in the keys."""
         return {
             **self.carried.to_dict(),
             "largest_stress_mpa": self.stress,
@@ -56,8 +56,8 @@ class ImplantLoad:
         lines = []
         for axis, name in enumerate(("bending out of its plane", "bending in its plane", "torsion")):
             at = int(moments[:, axis].abs().argmax())
-            told = f"{float(moments[at, axis]) / 1000:.2f} +- {float(std[at, axis]) / 1000:.2f} N m"
-            lines.append(f"{name}: {told} at {float(self.carried.heights[at]):.0f} mm from the lower end")
+            value = f"{float(moments[at, axis]) / 1000:.2f} +- {float(std[at, axis]) / 1000:.2f} N m"
+            lines.append(f"{name}: {value} at {float(self.carried.heights[at]):.0f} mm from the lower end")
         lines.append(f"von Mises stress: {self.stress:.0f} +- {self.stress_std:.0f} of {self.yield_stress:.0f} MPa")
         return "\n".join([*lines, *(f"warning: {text}" for text in self.warnings), f"folder {self.folder}"])
 
@@ -71,48 +71,50 @@ def load_files(
     name: str | None = None,
     figures: bool = True,
 ) -> ImplantLoad:
-    """Loads of the implant of a finished registration with finite elements; writes JSON, VTU and a figure.
+    """Estimate the loads of a registered implant from its finite elements; write JSON, VTU and a figure.
 
     Args:
-        run_folder: Folder of the registration.
-        out: Folder for `load.json`, `load.vtu` and `load.png`; it is made.
-        against: Folder of a registration of the same implant without load: what both have in common (it was bent
-            before it was implanted, or is not quite what the mesh says) is no load.
-        implant: Mesh of the undeformed implant; the one that the run was started with when None.
-        name: Of several implants, which.
-        figures: Whether to draw.
+        run_folder: Folder of a finished registration.
+        out: Folder for `load.json`, `load.vtu` and `load.png`, created if missing.
+        against: Folder of a registration of the same implant without load. Its deformation (bent before implantation,
+            or a mesh that differs from the implant) is subtracted, because it is no load.
+        implant: Mesh of the undeformed implant; the run's mesh if None.
+        name: Name of the implant, if the run has several.
+        figures: Draw the figure.
 
     Raises:
-        ValueError: If a run is not one with finite elements, or the two are of different implants.
+        ValueError: If a run did not use finite elements, or the two runs are of different implants.
         FileNotFoundError: If a file is missing.
     """
     result, registered = implant_of_run(run_folder, name)
-    own = _elastic(registered, run_folder)
-    amounts, covariance = own.amounts.detach(), own.covariance
+    loaded = _elastic(registered, run_folder)
+    amounts, covariance = loaded.amounts.detach(), loaded.covariance
     warnings = [f"the registration is {result.status}: {why}" for why in result.warnings if result.status != "ok"]
     if against is not None:
-        other = _elastic(implant_of_run(against, name)[1], against)
-        _require_same(own, other)
-        amounts = amounts - other.amounts.detach()
-        covariance = None if covariance is None or other.covariance is None else covariance + other.covariance
-    element = own.superelement
+        unloaded_state = _elastic(implant_of_run(against, name)[1], against)
+        _require_same(loaded, unloaded_state)
+        amounts = amounts - unloaded_state.amounts.detach()
+        covariance = (
+            None if covariance is None or unloaded_state.covariance is None else covariance + unloaded_state.covariance
+        )
+    element = loaded.superelement
     mesh = read_mesh(implant or mesh_of_run(run_folder, result.implants.index(registered)))
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE_MM)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     points = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
-    known = own.expected.covariance if covariance is None else covariance
-    rested = own.rested(points)
-    stress, std = node_stresses(element, rested, amounts, known)
+    uncertainty = loaded.expected.covariance if covariance is None else covariance
+    rest_points = loaded.rested(points)
+    stress, std = node_stresses(element, rest_points, amounts, uncertainty)
     worst, limit = int(stress.argmax()), element.constants.yield_stress
     if float(stress[worst]) > limit:
-        unloaded = against is not None or own.rest is not None
-        hint = "" if unloaded else "; a run without load takes that out: load --against it, or register --rest"
+        unloaded = against is not None or loaded.rest is not None
+        hint = "" if unloaded else "; a run without load removes that: load --against it, or register --rest"
         warnings.append(
-            f"stress reaches {float(stress[worst]):.0f} MPa, more than the {limit:.0f} MPa where the alloy yields: the "
-            f"implant {'stays bent' if unloaded else 'was bent before, or stays so,'} beyond this load{hint}"
+            f"stress reaches {float(stress[worst]):.0f} MPa, above the alloy's yield stress of {limit:.0f} MPa: the "
+            f"implant {'stays bent' if unloaded else 'was bent before, or stays bent,'} after this load{hint}"
         )
-    found = ImplantLoad(
-        CarriedLoad.of(element, amounts, covariance, own.expected),
+    load = ImplantLoad(
+        CarriedLoad.of(element, amounts, covariance, loaded.expected),
         float(stress[worst]),
         float(std[worst]),
         limit,
@@ -120,32 +122,32 @@ def load_files(
         out,
     )
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "load.json", plain(found.to_dict()))
+    write_json(out / "load.json", plain(load.to_dict()))
     placed = mesh.copy()
     placed.vertices = registered.warp(points).numpy()
     values = {"von_mises_mpa": stress, "von_mises_std_mpa": std, "displacement_mm": registered.displacement(points)}
     write_surface_vtu(out / "load.vtu", placed, values)
     if figures:
-        title = f"what the {registered.name} carries"
-        figure = load_figure(found.carried, rested, stress, yield_stress=limit, title=title)
+        title = f"loads of the {registered.name}"
+        figure = load_figure(load.carried, rest_points, stress, yield_stress=limit, title=title)
         write_figure(out / "load.png", figure)
-    return found
+    return load
 
 
 def _elastic(implant: RegisteredImplant, folder: Path) -> FiniteElementDeformation:
     if not isinstance(implant.deformation, FiniteElementDeformation):
         raise ValueError(
-            f"run folder {folder} was registered with --deformation {implant.deformation.model}, which knows no loads: "
+            f"run folder {folder} was registered with --deformation {implant.deformation.model}, which has no loads: "
             "register with --deformation fe"
         )
     return implant.deformation
 
 
-def _require_same(own: FiniteElementDeformation, other: FiniteElementDeformation) -> None:
-    ours, theirs = own.superelement, other.superelement
-    if ours.holds != theirs.holds or ours.constants != theirs.constants or not _alike(ours.loads, theirs.loads):
+def _require_same(loaded: FiniteElementDeformation, unloaded: FiniteElementDeformation) -> None:
+    first, second = loaded.superelement, unloaded.superelement
+    if first.holds != second.holds or first.constants != second.constants or not _alike(first.loads, second.loads):
         raise ValueError("the two runs are of different implants, materials or holds: their loads cannot be compared")
 
 
-def _alike(one: Tensor, other: Tensor) -> bool:
-    return one.shape == other.shape and torch.allclose(one, other, rtol=1e-4, atol=1e-4)
+def _alike(first: Tensor, second: Tensor) -> bool:
+    return first.shape == second.shape and torch.allclose(first, second, rtol=1e-4, atol=1e-4)

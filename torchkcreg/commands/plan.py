@@ -1,4 +1,4 @@
-"""Which views of a scan to take, out of an implant's mesh and the scanner's geometry."""
+"""Choose the best views of a scan from an implant's mesh and the scanner's geometry."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _SHOWN = 5
 
 @dataclass(frozen=True, eq=False)
 class ViewPlan:
-    """The best sets of views, for each number of them.
+    """The best sets of views for each number of views.
 
     Attributes:
-        geometry: All views.
-        best: Sets by their number of views, best first.
-        of_sources: The best set of three views of each source alone, by its name.
-        random: Expected errors (S,) of random sets by their number of views, mm.
-        folder: Where the files are.
+        geometry: All candidate views.
+        best: Sets for each number of views, best first.
+        of_sources: The best set of three views from a single source, by the source's name.
+        random: Expected errors (S,) of random sets for each number of views, mm.
+        folder: Output folder.
     """
 
     geometry: ConeBeamGeometry
@@ -41,7 +41,7 @@ class ViewPlan:
     folder: Path
 
     def label(self, view: int) -> str:
-        """A view in words: source and gantry angle, where the geometry says them."""
+        """Label of a view: number, source and gantry angle, if the geometry has them."""
         parts = [str(view)]
         if self.geometry.sources is not None:
             parts.append(self.geometry.sources[view])
@@ -50,15 +50,15 @@ class ViewPlan:
         return " ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types."""
+        """Dictionary of plain types."""
         return {
-            "best": {str(n): [asdict(one) for one in sets] for n, sets in self.best.items()},
-            "of_sources": {name: asdict(one) for name, one in self.of_sources.items()},
+            "best": {str(n): [asdict(planned) for planned in sets] for n, sets in self.best.items()},
+            "of_sources": {name: asdict(planned) for name, planned in self.of_sources.items()},
             "random_median_mm": {str(n): float(errors.median()) for n, errors in self.random.items()},
         }
 
     def table(self) -> str:
-        """A row a set, as CSV."""
+        """CSV table with a row per set."""
         rows = ["number,rank,node_std_mm,views"]
         for number, sets in self.best.items():
             rows += [f"{number},{i},{s.node_std_mm:.4f},{' '.join(map(str, s.views))}" for i, s in enumerate(sets, 1)]
@@ -70,9 +70,9 @@ class ViewPlan:
             first, median = sets[0], float(self.random[number].median())
             views = "; ".join(self.label(view) for view in first.views)
             lines.append(f"{number} views: {first.node_std_mm:.3f} mm expected ({median:.3f} at random): {views}")
-        for name, one in self.of_sources.items():
-            views = "; ".join(self.label(view) for view in one.views)
-            lines.append(f"{len(one.views)} views of {name} alone: {one.node_std_mm:.3f} mm expected: {views}")
+        for name, planned in self.of_sources.items():
+            views = "; ".join(self.label(view) for view in planned.views)
+            lines.append(f"{len(planned.views)} views of {name} alone: {planned.node_std_mm:.3f} mm expected: {views}")
         return "\n".join([*lines, f"folder {self.folder}"])
 
 
@@ -89,22 +89,22 @@ def plan_files(
     most: int = 6,
     figures: bool = True,
 ) -> ViewPlan:
-    """The best sets of views for an implant at a pose in a scanner; writes JSON, CSV and a figure.
+    """Find the best sets of views for an implant at a pose in a scanner; write JSON, CSV and a figure.
 
     Args:
         implant: Mesh of the undeformed implant.
-        geometry: All views to choose from.
-        out: Folder for `plan.json`, `plan.csv` and `plan.png`; it is made.
-        material: Of the implant.
-        components: Screws that move with it.
-        spectrum: Detected.
-        init: Its pose, or the run folder of a registration.
-        every: One view of so many is looked at.
-        most: Views in the largest sets.
-        figures: Whether to draw.
+        geometry: Projection matrices of all views to choose from.
+        out: Folder for `plan.json`, `plan.csv` and `plan.png`, created if missing.
+        material: Material of the implant.
+        components: Screws that move with the implant.
+        spectrum: Detected spectrum.
+        init: Pose of the implant, or the run folder of a registration.
+        every: Only every Nth view is a candidate; 1 for all views.
+        most: Largest number of views in a set.
+        figures: Draw the figure.
 
     Raises:
-        ValueError: If files are malformed, or there are fewer views than the sets should have.
+        ValueError: If files are malformed, or there are fewer candidate views than `most`.
         FileNotFoundError: If a file is missing.
     """
     if every < 1 or most < 2:
@@ -116,20 +116,20 @@ def plan_files(
     chosen = list(range(0, views.num_views, every))
     if len(chosen) < most:
         raise ValueError(f"there are {len(chosen)} views to choose from, fewer than the {most} of the largest sets")
-    known = view_information(scene, views, config, chosen)
+    information = view_information(scene, views, config, chosen)
     numbers = range(2, most + 1)
-    best = {number: known.best(number) for number in numbers}
-    random = {number: known.expected(_random_sets(len(chosen), number)) for number in numbers}
-    found = ViewPlan(views, best, _of_sources(known, views.sources, min(3, most)), random, out)
+    best = {number: information.best(number) for number in numbers}
+    random = {number: information.expected(_random_sets(len(chosen), number)) for number in numbers}
+    plan = ViewPlan(views, best, _of_sources(information, views.sources, min(3, most)), random, out)
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "plan.json", plain(found.to_dict()))
-    write_text(out / "plan.csv", found.table())
+    write_json(out / "plan.json", plain(plan.to_dict()))
+    write_text(out / "plan.csv", plan.table())
     if figures:
         angles = None if views.angles_deg is None else [float(a) for a in views.angles_deg]
-        labels = [[found.label(view) for view in one.views] for one in best[min(3, most)][:_SHOWN]]
+        labels = [[plan.label(view) for view in planned.views] for planned in best[min(3, most)][:_SHOWN]]
         figure = plan_figure(best, random, shown=best[min(3, most)][:_SHOWN], angles_deg=angles, labels=labels)
         write_figure(out / "plan.png", figure)
-    return found
+    return plan
 
 
 def _random_sets(number_of_views: int, number: int) -> Tensor:
@@ -138,9 +138,9 @@ def _random_sets(number_of_views: int, number: int) -> Tensor:
     return order[:, :number]
 
 
-def _of_sources(known: ViewInformation, sources: Sequence[str] | None, number: int) -> dict[str, PlannedSet]:
+def _of_sources(information: ViewInformation, sources: Sequence[str] | None, number: int) -> dict[str, PlannedSet]:
     names = [] if sources is None else sorted(set(sources))
     if len(names) < 2 or sources is None:
         return {}
-    own = {name: [view for view in known.views if sources[view] == name] for name in names}
-    return {name: known.best(number, among=views)[0] for name, views in own.items() if len(views) >= number}
+    views_of = {name: [view for view in information.views if sources[view] == name] for name in names}
+    return {name: information.best(number, among=views)[0] for name, views in views_of.items() if len(views) >= number}

@@ -1,4 +1,4 @@
-"""A reconstruction from files to a folder: volumes, what was measured, figures."""
+"""Reconstruct a volume from files: write volumes, metrics and figures to a folder."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ OUTPUTS = (
 
 
 def line_integrals(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Tensor:
-    """What FDK takes: line integrals, around known metal, or path lengths where the object is of one material alone."""
+    """Input of FDK (V, rows, cols): line integrals with known metal inpainted, or path lengths of a single material."""
     alone = options.single_material
     beam = inputs.beam.without_metals() if alone is None else BeamModel.monoenergetic([])
     lines = prepare(inputs.transmission, inputs.geometry, beam, scatter=inputs.scatter, mask=inputs.mask).line_integrals
@@ -65,7 +65,7 @@ def line_integrals(inputs: ReconstructionInputs, options: ReconstructionOptions)
 
 
 def counted(lines: Tensor) -> Callable[[list[int]], Tensor]:
-    """Views (V, rows, cols) as they are asked for, with a bar that shows how many there were."""
+    """Reader of views out of line integrals (V, rows, cols), with a progress bar that counts the views."""
     bar = progress_bar(total=len(lines), desc="views")
 
     def read(views: list[int]) -> Tensor:
@@ -76,7 +76,7 @@ def counted(lines: Tensor) -> Callable[[list[int]], Tensor]:
 
 
 def streamed(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Callable[[list[int]], Tensor]:
-    """The same of views as they are asked for, with a bar that shows how many there were."""
+    """Reader of FDK's input of some views from the projections' file, with a progress bar that counts the views."""
     bar = progress_bar(total=inputs.geometry.num_views, desc="views")
 
     def read(views: list[int]) -> Tensor:
@@ -89,7 +89,7 @@ def streamed(inputs: ReconstructionInputs, options: ReconstructionOptions) -> Ca
 
 @contextmanager
 def processes() -> Iterator[int]:
-    """The rank of this process; torch.distributed runs inside where ``torchrun`` started several."""
+    """Rank of this process. If `torchrun` started several, torch.distributed is initialized inside the block."""
     if int(os.environ.get("WORLD_SIZE", "1")) < 2:
         yield 0
         return
@@ -104,7 +104,7 @@ def processes() -> Iterator[int]:
 
 
 def resolve_options(overrides: dict[str, Any], config: Path | None = None) -> ReconstructionOptions:
-    """Options of a YAML or JSON file with overrides on top.
+    """Options of a YAML or JSON file, with overrides on top.
 
     Raises:
         ValueError: For unknown keys and wrong values, in one line that names them.
@@ -122,27 +122,26 @@ def reconstruct_files(
     resume: bool = False,
     figures: bool = True,
 ) -> dict[str, Any]:
-    """What was measured of a reconstruction whose folder is written to ``out``.
+    """Reconstruct a volume, write its folder `out`, and return the metrics.
 
-    The folder holds ``volume.mha`` in 1/mm (behind known components the background alone; of a single material the
-    share of it, and no CT numbers), ``volume_hu.mha``,
-    ``with_implant.mha`` (with known components), the same three as ``near_metal_...`` where voxels near the metal are
-    divided, ``metrics.json``, ``config.yaml``, ``slices.png``, ``report.html``
-    and, of an estimated beam, ``beam.png``. Under
-    ``torchrun`` the views are shared out over the processes and the first one writes.
+    The folder holds `volume.mha` in 1/mm (with known components: the background without them; with a single material:
+    its fraction per voxel, and no CT numbers), `volume_hu.mha`, `with_implant.mha` (with known components), the same
+    three as `near_metal_...` if voxels near the metal are divided, `metrics.json`, `config.yaml`, `slices.png`,
+    `report.html` and, with an estimated beam, `beam.png`. Under `torchrun` the views are distributed over the
+    processes, and the first process writes.
 
     Args:
-        files: What is reconstructed.
-        out: Folder to make.
-        options: How.
-        overwrite: Replace a reconstruction that is there.
-        resume: Continue one that was stopped; it must have been started with the same files and options.
-        figures: Draw slices.
+        files: Input files.
+        out: Output folder.
+        options: Options of the reconstruction.
+        overwrite: Replace an existing reconstruction.
+        resume: Continue an interrupted reconstruction, which must have been started with the same files and options.
+        figures: Draw figures and report.
 
     Raises:
-        ValueError: If files or options are wrong, or a resumed run was started with other ones.
+        ValueError: If files or options are wrong, or a resumed run was started with others.
         FileNotFoundError: If a file is missing.
-        FileExistsError: If ``out`` holds a run and neither overwrite nor resume was asked.
+        FileExistsError: If `out` holds a run and neither overwrite nor resume is set.
     """
     start = time.perf_counter()
     if files.run is not None and out.resolve() == files.run.resolve():
@@ -169,7 +168,7 @@ def _reconstructed(
     state: dict[str, Any] | None,
     out: Path,
 ) -> tuple[list[tuple[Tensor, VolumeGrid]], list[dict[str, Any]]]:
-    """The volume and its grid, and where voxels are divided those near the metal as well; records of the iterations."""
+    """Volume and grid, with those near the metal if voxels there are divided; and records of the iterations."""
     geometry, grid, backend = inputs.geometry, inputs.grid, options.backend
     if options.is_filtered:
         ramp = FDKConfig(window=options.window)
@@ -213,7 +212,7 @@ def _reconstructed(
 
 
 class _Checkpoints(Callback):
-    """Writes a checkpoint every few iterations, and at the end of a pass."""
+    """Write a checkpoint every few iterations and at the end of a pass."""
 
     def __init__(self, folder: RunFolder, iterations: int) -> None:
         self.folder, self.iterations = folder, iterations
@@ -256,21 +255,21 @@ def _write(
     metrics: dict[str, Any],
     figures: bool,
 ) -> None:
-    beam, shares, whole = inputs.beam, options.single_material is not None, None
+    beam, shares, with_implant = inputs.beam, options.single_material is not None, None
     for prefix, (volume, grid) in zip(("", "near_metal_"), levels, strict=False):
         write_volume(run.path / f"{prefix}volume.mha", volume, grid)
         if not shares:
             numbers = hounsfield(volume, beam.water).round().to(torch.int32)
             write_volume(run.path / f"{prefix}volume_hu.mha", numbers, grid)
         if inputs.components:
-            whole = _with_implant(inputs, volume, grid)
-            write_volume(run.path / f"{prefix}with_implant.mha", whole, grid)
+            with_implant = _with_implant(inputs, volume, grid)
+            write_volume(run.path / f"{prefix}with_implant.mha", with_implant, grid)
     if figures:
-        if (found := inputs.estimate) is not None:
-            curve = beam_figure(found.beam.beam, found.alloys, found.lengths_mm, found.measured)
+        if (estimate := inputs.estimate) is not None:
+            curve = beam_figure(estimate.beam.beam, estimate.alloys, estimate.lengths_mm, estimate.measured)
             run.write_figure("beam.png", curve)
         window = (0.0, 1.2 if shares else 2 * beam.water)
-        run.write_figure("slices.png", _slices(inputs, *levels[-1], whole, window))
+        run.write_figure("slices.png", _slices(inputs, *levels[-1], with_implant, window))
     run.write_metrics(metrics)
     if figures:
         write_report(run.path)
@@ -286,14 +285,18 @@ def _with_implant(inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid
 
 
 def _slices(
-    inputs: ReconstructionInputs, volume: Tensor, grid: VolumeGrid, whole: Tensor | None, window: tuple[float, float]
+    inputs: ReconstructionInputs,
+    volume: Tensor,
+    grid: VolumeGrid,
+    with_implant: Tensor | None,
+    window: tuple[float, float],
 ) -> Figure:
-    """Three heights of a volume, and of the same with the implant in it, where there is one."""
+    """Figure of slices at three heights, of the volume and, with known components, of the volume with implant."""
     middle, reach = grid.origin[2] + grid.size_mm[2] / 2, grid.size_mm[2] / 4
     heights = (middle - reach, middle, middle + reach) if grid.shape[0] > 3 else (middle,)
     shown, metal = {"reconstruction": volume}, None
-    if whole is not None:
-        shown = {"background": volume, "with the implant": whole}
+    if with_implant is not None:
+        shown = {"background": volume, "with the implant": with_implant}
         metal = sum((component.fraction(grid) for component in inputs.components), torch.zeros(grid.shape))
     return reconstruction_figure(shown, grid, heights_mm=heights, window=window, metal=metal)
 
@@ -306,8 +309,8 @@ def _record(files: ReconstructionFiles, options: ReconstructionOptions) -> dict[
 def _folder(out: Path, record: dict[str, Any], *, overwrite: bool, resume: bool) -> RunFolder:
     run = RunFolder.create(out, overwrite=overwrite, resume=resume)
     if resume:
-        kept = read_config(run.path / "config.yaml")
-        changed = sorted(key for key in kept.keys() | record.keys() if kept.get(key) != record.get(key))
+        previous = read_config(run.path / "config.yaml")
+        changed = sorted(key for key in previous.keys() | record.keys() if previous.get(key) != record.get(key))
         if changed:
             raise ValueError(f"run folder {run.path} was started with other {' and '.join(changed)}")
         return run

@@ -1,4 +1,4 @@
-"""What a reconstruction is made from: files, options, and what they hold."""
+"""Inputs of a reconstruction, read from files and checked: projections, grid, beam, scatter, registered implant."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from torchkcreg.registration import RegistrationResult
 
 from .reconstruct_options import ReconstructionFiles, ReconstructionOptions
 
-SAMPLE_VIEWS = 20  # of a scan that is streamed, for what is told from all views
-ALLOYS = ("titanium", "steel", "cocr")  # of which an implant is that nobody named
+SAMPLE_VIEWS = 20  # of a streamed scan, for estimates that otherwise use all views
+ALLOYS = ("titanium", "steel", "cocr")  # candidates if the implant's material is unknown
 
 
 def registered_components(
@@ -49,53 +49,53 @@ def registered_components(
     pitch_mm: float | None = None,
     result: RegistrationResult | None = None,
 ) -> list[KnownComponent]:
-    """The implant of a run as it was registered, then its screws, in world mm.
+    """The registered implant of a run, then its screws, in world mm.
 
     Args:
-        run: folder of a finished registration.
-        components: screws to take instead of those of the registration, which were given to it or which it found;
-            each follows the implant near its head.
-        material: the implant's, where the registration had none.
-        pitch_mm: of the nodes; the registration's if None.
-        result: of the run, where it was read already.
+        run: Folder of a finished registration.
+        components: Screws that replace those of the registration (given or detected); each follows the implant near
+            its head.
+        material: Material of the implant, if the registration had none.
+        pitch_mm: Spacing of the nodes; that of the registration if None.
+        result: Result of the run, if already read.
 
     Raises:
-        ValueError: nothing says what the implant is made of.
-        FileNotFoundError: the run is not finished, or a file it was made from is gone.
+        ValueError: If the implant's material is unknown.
+        FileNotFoundError: If the run is not finished, or one of its input files is missing.
     """
     result, files = result or read_run(run), read_config(Path(run) / "config.yaml").get("files") or {}
     meshes = [files["implant"]] if isinstance(files["implant"], str) else files["implant"]
     screws = None if components is None else read_components(components)
     if screws is not None and len(meshes) > 1:
         raise ValueError(f"run {run} has {len(meshes)} implants: screws cannot be named for all of them at once")
-    known = []
+    components_in_world = []
     for implant, mesh in zip(result.implants, meshes, strict=True):
         try:
-            own = implant.known_components(
+            implant_components = implant.known_components(
                 read_mesh(mesh), screws=screws, material=material, pitch=pitch_mm or result.config.pitch_mm
             )
         except ValueError as error:
             raise ValueError(f"run {run}: {error} with --material") from None
-        known += own
-    return known
+        components_in_world += implant_components
+    return components_in_world
 
 
 @dataclass(frozen=True)
 class ReconstructionInputs:
-    """What files and options amount to.
+    """Inputs of a reconstruction.
 
     Attributes:
         geometry: All views.
-        transmission: Measured intensity over the open beam's, (V, rows, cols); masked pixels filled.
-        mask: 0 where a pixel holds no measurement.
-        grid: The voxels.
-        beam: Energies and the metals' attenuation.
-        scatter: Smooth scatter, or an image of it in units of the open beam; None for none.
-        spectrum: As detected; a likely one where no file says it.
-        estimate: What was estimated of the beam, where that was asked for.
-        file: Where the views are that are not in `transmission`, which then are a sample of them; None if all are.
-        components: The metal in its place; none but for "kcrec" and "kcmar".
-        blur_sigma_px: The system's blur as the registration found it, in pixels.
+        transmission: Measured intensity over that of the open beam (V, rows, cols); masked pixels are filled.
+        mask: 0 for pixels without a measurement (V, rows, cols).
+        grid: Voxel grid of the volume.
+        beam: Beam model: energies and attenuation of the metals.
+        scatter: Smooth scatter model, or scatter image in units of the open beam; None for no scatter.
+        spectrum: Detected spectrum; a typical tungsten spectrum if no file gives it.
+        estimate: Estimated beam, with `beam` "estimate"; else None.
+        file: File from which views are streamed; `transmission` then holds a sample of the views. None if it holds all.
+        components: Registered metal, in the world; empty except for "kcrec" and "kcmar".
+        blur_sigma_px: Standard deviation of the imaging blur found by the registration, in pixels.
     """
 
     geometry: ConeBeamGeometry
@@ -111,15 +111,15 @@ class ReconstructionInputs:
     blur_sigma_px: float = 0.0
 
     def of_views(self, views: list[int]) -> ReconstructionInputs:
-        """The same of some views, read from the file."""
+        """The inputs of some views, read from the file."""
         if self.file is None:
-            raise ValueError("all views are at hand")
+            raise ValueError("all views are already in memory")
         part = self.file.read(views)
         transmission = torch.exp(-filled(part.line_integrals, part.mask))
         return replace(self, geometry=self.geometry.select(views), transmission=transmission, mask=part.mask, file=None)
 
     def scatter_in_words(self) -> dict[str, float] | None:
-        """The scatter's figures, as metrics have them."""
+        """Summary of the scatter for the metrics; None for no scatter."""
         if self.scatter is None:
             return None
         if isinstance(self.scatter, Veil):
@@ -133,11 +133,11 @@ class ReconstructionInputs:
 
 
 def read_reconstruction_inputs(files: ReconstructionFiles, options: ReconstructionOptions) -> ReconstructionInputs:
-    """The inputs of a reconstruction; nothing is written.
+    """Read and check the inputs of a reconstruction, without writing anything.
 
     Raises:
-        ValueError: Files that are malformed or don't fit together, or a file that neither flag nor run names.
-        FileNotFoundError: A file is missing.
+        ValueError: If files are malformed or do not fit together, or a file is named neither by flag nor by run.
+        FileNotFoundError: If a file is missing.
     """
     files = _completed(files)
     if files.geometry is None or files.projections is None:
@@ -145,36 +145,36 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     geometry = read_geometry(files.geometry, projections=files.projections)
     file = _file(files.projections, files.open_beam, geometry, options) if options.stream else None
     if file is None:
-        projections, shown = read_projections(files.projections, open_beam=files.open_beam), geometry
+        projections, sample_geometry = read_projections(files.projections, open_beam=files.open_beam), geometry
     else:
         sample = sorted({round(i * (len(file) - 1) / (SAMPLE_VIEWS - 1)) for i in range(SAMPLE_VIEWS)})
-        projections, shown = file.read(sample), geometry.select(sample)
-    projections.check_against(shown)
-    components, named, result = [], options.material, None
+        projections, sample_geometry = file.read(sample), geometry.select(sample)
+    projections.check_against(sample_geometry)
+    components, material_name, result = [], options.material, None
     if options.method in ("kcrec", "kcmar"):
         if files.run is None:
             raise ValueError(f"method {options.method} needs the run of a registration: name it with --run")
         result = read_run(files.run)
-        named = options.material or result.implants[0].material
-        likely = ALLOYS[0] if options.beam == "estimate" and named is None else options.material
-        components = registered_components(files.run, components=files.components, material=likely, result=result)
-    elif options.beam != "given":
-        raise ValueError(
-            f"beam {options.beam} comes from known metal, which kcrec and kcmar have, not {options.method}"
+        material_name = options.material or result.implants[0].material
+        assumed_material = ALLOYS[0] if options.beam == "estimate" and material_name is None else options.material
+        components = registered_components(
+            files.run, components=files.components, material=assumed_material, result=result
         )
+    elif options.beam != "given":
+        raise ValueError(f"beam {options.beam} needs known metal: use method kcrec or kcmar, not {options.method}")
     if options.refine > 1 and options.method != "kcrec":
-        raise ValueError(f"voxels are divided near known metal, which kcrec has, not {options.method}")
+        raise ValueError(f"voxels are divided near known metal: use method kcrec, not {options.method}")
     if options.soft_tissue is not None and options.beam != "estimate":
-        raise ValueError("soft tissue fixes the scale of an estimated beam: it goes with beam estimate")
+        raise ValueError("soft tissue fixes the scale of an estimated beam: it needs beam estimate")
     if options.beam != "given" and options.monoenergetic:
-        raise ValueError(f"a beam of one energy is never that of beam {options.beam}: leave one of the two out")
+        raise ValueError(f"monoenergetic cannot be combined with beam {options.beam}: leave one of the two out")
     spectrum = read_spectrum(files.spectrum) if files.spectrum is not None else None
     if options.single_material is not None:
         material(options.single_material)
         if options.method != "fdk":
-            raise ValueError(f"a single material goes with method fdk, not {options.method}")
+            raise ValueError(f"a single material needs method fdk, not {options.method}")
     if options.scatter == "run" and files.run is None:
-        raise ValueError("scatter as a registration found it needs its run: name it with --run")
+        raise ValueError("scatter run needs the run of a registration: name it with --run")
     if (note := projections.masked_note()) is not None:
         warnings.warn(f"projections file {files.projections}: {note}", stacklevel=2)
     transmission = torch.exp(-filled(projections.line_integrals, projections.mask))
@@ -182,7 +182,9 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
     if options.scatter == "run" and files.run is not None:
         scatter = (result or read_run(files.run)).scatter(transmission, geometry, mask=projections.mask)
     else:
-        scatter = _scatter(transmission, projections.mask, shown, options, saturated=projections.num_saturated > 0)
+        scatter = _scatter(
+            transmission, projections.mask, sample_geometry, options, saturated=projections.num_saturated > 0
+        )
     grid, estimate = _grid(geometry, options), None
     if options.beam == "estimate":
 
@@ -201,10 +203,10 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
                 backend=options.backend,
             )
 
-        estimate = estimated(() if named else ALLOYS)
-        found = dict(zip(known_materials(components), estimate.alloys, strict=True))
-        components = [replace(component, material=found[component.material]) for component in components]
-        if len(set(estimate.alloys)) < len(estimate.alloys):  # two that are one have one factor
+        estimate = estimated(() if material_name else ALLOYS)
+        alloy_of = dict(zip(known_materials(components), estimate.alloys, strict=True))
+        components = [replace(component, material=alloy_of[component.material]) for component in components]
+        if len(set(estimate.alloys)) < len(estimate.alloys):  # metals of the same alloy share one factor: fit again
             estimate = estimated()
     return ReconstructionInputs(
         geometry,
@@ -225,7 +227,7 @@ def _file(
     path: Path, open_beam: float | None, geometry: ConeBeamGeometry, options: ReconstructionOptions
 ) -> ProjectionFile:
     if options.scatter == "run" or options.beam == "estimate":
-        raise ValueError("the run's scatter, or an estimated beam, need all views at once: leave out stream")
+        raise ValueError("scatter run and beam estimate need all views at once: leave out stream")
     file = ProjectionFile(path, open_beam=open_beam)
     if len(file) != geometry.num_views:
         raise ValueError(f"projections file {path} has {len(file)} views, the geometry has {geometry.num_views}")
@@ -233,15 +235,15 @@ def _file(
 
 
 def _completed(files: ReconstructionFiles) -> ReconstructionFiles:
-    """Files with those that the run was made from where none are given."""
+    """The files, with missing ones taken from the run."""
     if files.run is None:
         return files
     record = read_config(files.run / "config.yaml").get("files") or {}
     names = ("geometry", "projections", "spectrum")
-    own = {name: getattr(files, name) or (Path(record[name]) if record.get(name) else None) for name in names}
+    paths = {name: getattr(files, name) or (Path(record[name]) if record.get(name) else None) for name in names}
     open_beam = files.open_beam if files.open_beam is not None else record.get("open_beam")
     return ReconstructionFiles(
-        run=files.run, components=files.components, open_beam=open_beam, initial=files.initial, **own
+        run=files.run, components=files.components, open_beam=open_beam, initial=files.initial, **paths
     )
 
 
@@ -265,11 +267,11 @@ def _beam(
         energy = (spectrum or tungsten_spectrum()).mean_energy
         water = float(material("water").attenuation((energy,))[0])
         return BeamModel.monoenergetic([float(m.attenuation((energy,))[0]) for m in metals], water=water)
-    likely = spectrum or tungsten_spectrum()
+    assumed_spectrum = spectrum or tungsten_spectrum()
     if options.beam == "run" and result is not None:
-        found = Beam.of(metals, likely).behind(result.intensity.get("hardness", 0.0), range(len(metals)))
-        return BeamModel.behind(found, reference_kev=likely.mean_energy)
-    return BeamModel.polyenergetic(metals, likely)
+        hardened = Beam.of(metals, assumed_spectrum).behind(result.intensity.get("hardness", 0.0), range(len(metals)))
+        return BeamModel.behind(hardened, reference_kev=assumed_spectrum.mean_energy)
+    return BeamModel.polyenergetic(metals, assumed_spectrum)
 
 
 def _scatter(
@@ -280,6 +282,6 @@ def _scatter(
     if options.scatter != "auto":
         return Veil(float(options.scatter), options.scatter_sigma_mm)
     usable = mask.bool()
-    if saturated:  # a full pixel says only that there is at least as much
+    if saturated:  # a saturated pixel is only a lower bound of the intensity
         usable = usable & (transmission < 0.9999 * transmission.max())
     return fit_veil(transmission, geometry.pixel_spacing, mask=usable)

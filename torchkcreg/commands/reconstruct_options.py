@@ -1,4 +1,4 @@
-"""What a reconstruction from files is asked for: the files, and the options."""
+"""Files and options of a reconstruction."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from torchkcreg.options import Config
 
 @dataclass(frozen=True)
 class ReconstructionFiles:
-    """The files of a reconstruction; what is not given comes from the run.
+    """Input files of a reconstruction; missing ones are taken from the run.
 
     Attributes:
-        run: Folder of a finished registration: the implant in its place.
+        run: Folder of a finished registration, which gives the registered implant.
         geometry: Projection matrices.
         projections: Intensities or line integrals of all views.
         spectrum: Detected spectrum.
-        components: Screws to take instead of the run's.
-        open_beam: Unattenuated intensity where the projections' file does not say it.
-        initial: Volume to start PWLS from.
+        components: Screws that replace those of the run.
+        open_beam: Unattenuated intensity, if the projections' file does not give it.
+        initial: Start volume of PWLS.
     """
 
     run: Path | None = None
@@ -38,33 +38,34 @@ class ReconstructionOptions(Config):
     """Options of a reconstruction; unknown keys are refused.
 
     Attributes:
-        method: "fdk"; "pwls"; "kcrec", PWLS of what the registered implant leaves.
-        spacing_mm: Edge of a voxel.
+        method: "fdk"; "pwls"; "kcmar", FDK with the registered metal inpainted in the projections; "kcrec", PWLS of the
+            background around the registered implant.
+        spacing_mm: Voxel size.
         size_mm: Size (x, y, z) of the volume; the field of view if None.
-        center_mm: Its middle (x, y, z), where a size is given.
-        refine: Voxels near known metal are divided into so many along each edge ("kcrec"); 1: none are.
-        refine_within_mm: How near.
-        preset: "momentum" or "paper" (500 iterations of 20 subsets).
-        iterations: Overrides the preset's.
-        subsets: Overrides the preset's.
-        beta: Weight of the roughness.
-        passes: Of the iterative methods; from the second on, mineral's hardening and the scatter in the metal's shadow
-            are known from the pass before. None: two of "kcrec", which needs both, one of "pwls".
-        window: Of the ramp.
-        scatter: "auto" fits a smooth one to the air around the object; "run" is what the registration found, of both
-            kinds; "none"; or its fraction of the primary.
-        scatter_sigma_mm: How broad a given fraction's scatter is.
-        monoenergetic: One energy, as in the paper, even where a spectrum is known.
-        beam: "given" is the spectrum of the file and the materials of the run, or a likely one; "run" is the same, as
-            hard as the registration found it; "estimate" is what the
-            metal's shadow tells of a spectrum, or an implant's material, that nobody knows (methods with components).
-        soft_tissue: Attenuation over water of what most of the object is, where an estimated beam may rest on that: 1
+        center_mm: Center (x, y, z) of the volume, if a size is given.
+        refine: Number of parts along each edge into which voxels near known metal are divided ("kcrec"); 1: none.
+        refine_within_mm: Distance from the metal within which voxels are divided.
+        preset: "momentum" (50 iterations) or "paper" (500 iterations of 20 subsets).
+        iterations: Number of iterations; the preset's if None.
+        subsets: Number of ordered subsets; the preset's if None.
+        beta: Weight of the roughness penalty.
+        passes: Passes of the iterative methods. From the second on, beam hardening by bone mineral and scatter in the
+            metal's shadow are corrected from the previous pass. None: two for "kcrec", which needs both; else one.
+        window: Window of the ramp filter.
+        scatter: "auto" fits smooth scatter to the air around the object; "run" takes both scatter terms of the
+            registration; "none"; or the scatter as a fraction of the primary.
+        scatter_sigma_mm: Width of the scatter, if its fraction is given.
+        monoenergetic: Use one energy, as in the paper, even if a spectrum is given.
+        beam: "given" uses the spectrum of the file, or a typical one, and the materials of the run; "run" uses the same
+            with the hardness found by the registration; "estimate" fits spectrum and alloy to the metal's shadow
+            (methods with components).
+        soft_tissue: Attenuation of most of the object relative to water, which fixes the scale of an estimated beam: 1
             in a water bath.
-        stream: Views are read some at a time, of scans that are larger than memory; iterative methods keep what they
-            make of them in files in the folder, for as long as they run.
-        material: The implant's, where the registration had none.
-        single_material: What the object is of, where it is of one material alone, such as an implant on a bench: "fdk"
-            gives the share of it in each voxel, without beam hardening.
+        stream: Read a few views at a time, for scans larger than memory. Iterative methods keep intermediate data in
+            files in the output folder while they run.
+        material: Material of the implant, if the registration had none.
+        single_material: Material of the object, if it consists of only one, such as an implant on a bench: "fdk" gives
+            its fraction in each voxel, without beam hardening.
         backend: Projector: "auto", "cpp" or "torch".
     """
 
@@ -92,12 +93,12 @@ class ReconstructionOptions(Config):
 
     @property
     def is_filtered(self) -> bool:
-        """Whether it is a filtered back-projection, without iterations."""
+        """True if the method is a filtered back-projection, without iterations."""
         return self.method in ("fdk", "kcmar")
 
     @property
     def num_passes(self) -> int:
-        """Passes that are made."""
+        """Number of passes."""
         if self.passes is not None:
             return self.passes
         return 2 if self.method == "kcrec" else 1

@@ -1,4 +1,4 @@
-"""A registration from files to a run folder: read, check, register, draw."""
+"""Register implants from files and write the run folder, or only check the inputs (dry run)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ RECORD_KEYS = {"files", "options", "schedule"}
 
 
 def resolve_config(path: Path | None, overrides: dict[str, Any]) -> RegistrationConfig:
-    """Options of a file with overrides on top; the file may be the ``config.yaml`` of a run.
+    """Options of a file, with overrides on top; the file may be the `config.yaml` of a run.
 
     Raises:
         ValueError: For unknown keys and wrong values, in one line that names them.
@@ -56,25 +56,24 @@ def register_files(
     figures: bool = True,
     callbacks: Sequence[Callback] = (),
 ) -> RegistrationResult:
-    """The result of a registration whose run folder is written to ``out``.
+    """Register implants, write the run folder `out`, and return the result.
 
-    All inputs are read and checked before anything is written. What a user should know before trusting the numbers is
-    given as Python warnings and stands in the result, with a status: a failed registration is written too, for looking
-    at.
+    All inputs are read and checked before anything is written. Reasons to doubt the result are given as Python warnings
+    and kept in the result, with a status. A failed registration is written too, for inspection.
 
     Args:
-        files: What is registered to what.
+        files: Input files: implants, geometry, projections, ...
         out: Run folder.
-        overrides: Options that override those of ``files.config``.
-        overwrite: Replace a run that is there.
-        resume: Continue one; it must have been started with the same files and options.
-        figures: Draw overlay, displacement map and history.
-        callbacks: Called along the way, after the progress bar and the writing of checkpoints.
+        overrides: Options that override those of `files.config`.
+        overwrite: Replace an existing run.
+        resume: Continue an interrupted run, which must have been started with the same files and options.
+        figures: Draw overlay, displacement map and history, and write the report.
+        callbacks: Callbacks of the optimization, called after the progress bar and the checkpoints.
 
     Raises:
-        ValueError: If files or options are wrong, or a resumed run was started with other ones.
+        ValueError: If files or options are wrong, or a resumed run was started with others.
         FileNotFoundError: If a file is missing.
-        FileExistsError: If ``out`` holds a run and neither overwrite nor resume was asked.
+        FileExistsError: If `out` holds a run and neither overwrite nor resume is set.
     """
     start = time.perf_counter()
     config = resolve_config(files.config, overrides or {})
@@ -108,7 +107,7 @@ def prepared_trainer(inputs: RegistrationInputs, config: RegistrationConfig) -> 
 def train(
     trainer: Trainer, run: RunFolder, inputs: RegistrationInputs, *, callbacks: Sequence[Callback] = ()
 ) -> RegistrationResult:
-    """The result of a trainer whose checkpoints go to a run folder; its warnings begin with those of the inputs."""
+    """Run the trainer with checkpoints in the run folder; return the result, with the warnings of the inputs first."""
     trainer.callbacks += [_Checkpoints(run), *callbacks]
     result = trainer.fit().to("cpu")
     trainer.data = trainer.data.to("cpu")
@@ -126,7 +125,7 @@ def write_run(
     figures: bool,
     more_metrics: dict[str, Any] | None = None,
 ) -> None:
-    """Nothing; writes metrics, figures and the result of a finished registration to its run folder."""
+    """Write metrics, figures and result of a finished registration to its run folder."""
     starts = inputs.starts
     run.write_metrics({**_metrics(result, trainer.scene, starts, seconds), **(more_metrics or {})})
     if figures:
@@ -141,7 +140,7 @@ def write_run(
 
 
 class _Checkpoints(Callback):
-    """Writes a checkpoint after the steps that precede a stage's iterations, every few seconds then, and at its end."""
+    """Write a checkpoint at the first iteration of a stage, every few seconds after it, and at the end of the stage."""
 
     def __init__(self, run: RunFolder) -> None:
         self.folder, self.last = run, time.perf_counter()
@@ -160,7 +159,7 @@ class _Checkpoints(Callback):
 
 
 def run_record(files: RegistrationFiles, config: RegistrationConfig) -> dict[str, Any]:
-    """What config.yaml keeps: files, options and the stages that they resolve to."""
+    """Content of config.yaml: files, options and the resulting schedule of stages."""
     names = {key: _recorded(value) for key, value in vars(files).items() if value is not None}
     schedule = [stage.model_dump(mode="json") for stage in config.schedule()]
     return {"files": names, "options": config.model_dump(mode="json"), "schedule": schedule}
@@ -169,13 +168,13 @@ def run_record(files: RegistrationFiles, config: RegistrationConfig) -> dict[str
 def _recorded(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value.resolve())
-    return [_recorded(one) for one in value] if isinstance(value, (list, tuple)) else value
+    return [_recorded(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def _continue(run: RunFolder, trainer: Trainer, record: dict[str, Any]) -> None:
-    kept = read_config(run.path / "config.yaml")
+    previous = read_config(run.path / "config.yaml")
     for part in ("options", "files"):
-        before, now = kept.get(part) or {}, record[part]
+        before, now = previous.get(part) or {}, record[part]
         changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
         if changed:
             raise ValueError(f"run folder {run.path} was started with other {part}: {', '.join(changed)}")
@@ -205,20 +204,20 @@ def _metrics(result: RegistrationResult, scene: Scene, starts: Sequence[Tensor],
 
 
 def _motion(distances: Tensor) -> dict[str, float]:
-    """How far nodes (N,) have moved from the start pose."""
+    """Mean and largest distance of the nodes (N,) from the start pose."""
     return {"mean_motion_mm": float(distances.mean()), "largest_motion_mm": float(distances.max())}
 
 
 def dry_run(files: RegistrationFiles, picture: Path | None, *, overrides: dict[str, Any] | None = None) -> list[str]:
-    """Lines for people about a registration that is not run: what was read, and the implant in each view at the start.
+    """Check the inputs of a registration and report, in lines of text, the implant's start pose in each view.
 
     Args:
-        files: what would be registered to what.
-        picture: PNG to write, the implant at its start over the views; none if None.
-        overrides: options that override those of ``files.config``.
+        files: Input files, as for `register_files`.
+        picture: PNG to write: the implant at its start pose over the views. No figure if None.
+        overrides: Options that override those of `files.config`.
 
     Raises:
-        ValueError, FileNotFoundError: as the registration itself would.
+        ValueError, FileNotFoundError: As `register_files`.
     """
     config = resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
@@ -240,7 +239,7 @@ def dry_run(files: RegistrationFiles, picture: Path | None, *, overrides: dict[s
 
 
 def _in_views(nodes: Tensor, geometry: ConeBeamGeometry) -> list[str]:
-    """Where nodes (N, 3) lie in each view, a line each."""
+    """Position and magnification of nodes (N, 3) in each view, a line per view."""
     uv, depth = geometry.project(nodes)
     rows, cols = geometry.det_shape
     inside = ((uv > -0.5) & (uv < uv.new_tensor([cols - 0.5, rows - 0.5]))).all(-1).double().mean(-1)

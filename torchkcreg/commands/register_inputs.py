@@ -32,13 +32,13 @@ from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConf
 from torchkcreg.scene import RegistrationData
 
 _FEWEST_NODES_ALONG = 4
-_SAME_FRAME_MM = 5.0  # by which bounds of one implant may differ: nodes do not reach its surface
+_SAME_FRAME_MM = 5.0  # tolerance between bounds of nodes and mesh: nodes do not reach the surface
 _FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
 
 
 @dataclass(frozen=True)
 class ImplantFiles:
-    """The files of one implant, see `torchkcreg.commands.RegistrationFiles`."""
+    """Files of one implant, see `torchkcreg.commands.RegistrationFiles`."""
 
     name: str
     mesh: Path
@@ -49,7 +49,7 @@ class ImplantFiles:
 
 
 def read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
-    """One implant of a registration.
+    """Read one implant of a registration.
 
     Raises:
         ValueError: If a file is malformed.
@@ -74,7 +74,7 @@ def read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
 
 
 def _start_pose(files: ImplantFiles, mesh: trimesh.Trimesh) -> Tensor | None:
-    """A pose out of a file, or that of the same implant in the run folder of another registration."""
+    """Start pose from a file, or from the same implant in another registration's run folder; None for no file."""
     if files.init is None or not files.init.is_dir():
         return read_init(files.init) if files.init else None
     return _registered(files.init, files, mesh).implant_to_world
@@ -105,19 +105,20 @@ def _check_size(path: Path, mesh: trimesh.Trimesh, pitch_mm: float) -> None:
 
 @dataclass(frozen=True)
 class RegistrationFiles:
-    """The files of a registration; of several implants, lists of as many entries, None where there is none.
+    """Input files of a registration. With several implants, the files per implant are lists (None: no file).
 
     Attributes:
         implant: Closed mesh of the undeformed implant, mm.
         geometry: Projection matrices.
         projections: Intensities or line integrals.
-        spectrum: Detected spectrum; None takes a 90 kV tungsten spectrum where a material is named.
+        spectrum: Detected spectrum; if None and a material is named, a 90 kV tungsten spectrum is used.
         components: Screws that move with the implant.
-        init: Approximate pose, or the run folder of another registration of the implant.
-        rest: Run folder of a registration of the implant without load: finite elements bend it from that shape.
-        materials: Of each of several implants, where they are not of one.
-        views: Views to use; None takes all.
-        open_beam: Unattenuated intensity where the projections' file does not say it.
+        init: Approximate pose, or run folder of another registration of the implant.
+        rest: Run folder of a registration of the implant without load; its shape is the rest shape of the finite
+            elements.
+        materials: Material of each implant, if they differ.
+        views: Views to use; None for all.
+        open_beam: Unattenuated intensity, if the projections' file does not give it.
         config: Options as YAML or JSON.
     """
 
@@ -134,10 +135,10 @@ class RegistrationFiles:
     config: Path | None = None
 
     def each(self) -> list[ImplantFiles]:
-        """The files of each implant.
+        """Files of each implant.
 
         Raises:
-            ValueError: If there are not as many of a kind as there are implants.
+            ValueError: If a list of files is not as long as that of implants, or two meshes share a name.
         """
         meshes = [self.implant] if isinstance(self.implant, Path) else list(self.implant)
         names = [mesh.stem for mesh in meshes] if len(meshes) > 1 else ["implant"]
@@ -145,8 +146,8 @@ class RegistrationFiles:
             times = names.count(twice[0])
             raise ValueError(f"implants are named after their files, but {twice[0]} is there {times} times")
         return [
-            ImplantFiles(*one)
-            for one in zip(
+            ImplantFiles(*entries)
+            for entries in zip(
                 names,
                 meshes,
                 _for_each(self.components, len(meshes), "components"),
@@ -158,24 +159,24 @@ class RegistrationFiles:
         ]
 
 
-def _for_each(given: Any, number: int, what: str) -> list[Any]:
-    listed = [given] if given is None or isinstance(given, (str, Path)) else list(given)
-    if given is None:
+def _for_each(paths: Any, number: int, kind: str) -> list[Any]:
+    listed = [paths] if paths is None or isinstance(paths, (str, Path)) else list(paths)
+    if paths is None:
         return [None] * number
     if len(listed) != number:
-        raise ValueError(f"{number} implants need as many {what}, got {len(listed)}; - stands for none")
+        raise ValueError(f"{number} implants need as many {kind}, got {len(listed)}; use - for none")
     return listed
 
 
 @dataclass(frozen=True)
 class RegistrationInputs:
-    """What the files hold.
+    """Inputs of a registration, as read from its files.
 
     Attributes:
         implants: Each undeformed implant with its components, holes and start pose.
         data: Projections and geometry of the views to use.
-        spectrum: Detected spectrum, where one was given.
-        warnings: What a user should know about them, a line each.
+        spectrum: Detected spectrum; None if not given.
+        warnings: Warnings about the inputs, a line each.
     """
 
     implants: list[Implant]
@@ -191,10 +192,10 @@ class RegistrationInputs:
 
 
 def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationInputs:
-    """The inputs of a registration; nothing is written.
+    """Read and check the inputs of a registration, without writing anything.
 
     Raises:
-        ValueError: If a file is malformed, files do not fit together, or an option cannot be had here.
+        ValueError: If a file is malformed, files do not fit together, or an option is not available on this machine.
         FileNotFoundError: If a file is missing.
     """
     _check_options(files, config)
@@ -202,9 +203,9 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
         each = files.each()
         data = _read_data(files, config)
         spectrum = read_spectrum(files.spectrum) if files.spectrum else None
-        implants = [read_implant(one, config) for one in each]
-        for one in implants:
-            points, pose = one.cloud.points, one.implant_to_world
+        implants = [read_implant(implant, config) for implant in each]
+        for implant in implants:
+            points, pose = implant.cloud.points, implant.implant_to_world
             placed = points if pose is None else transform_points(pose, points.double())
             if (doubt := implausible_magnification(data.facing(placed).geometry, placed)) is not None:
                 warnings.warn(doubt, stacklevel=2)
@@ -224,12 +225,12 @@ def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None
 
 
 def _device(name: str) -> Tensor:
-    """An empty tensor on a device; ValueError where there is no such one."""
+    """An empty tensor on a device; ValueError if the device does not exist."""
     try:
         return torch.empty(0, device=name)
-    except (RuntimeError, AssertionError, ValueError) as error:  # torch's own way to say so depends on the device
+    except (RuntimeError, AssertionError, ValueError) as error:  # which one torch raises depends on the device
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"device {name!r} is not to be had: {reason[:120]}") from error
+        raise ValueError(f"device {name!r} is not available: {reason[:120]}") from error
 
 
 def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationData:
@@ -239,7 +240,7 @@ def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> Registra
     if files.views is not None:
         projections = (
             read_projections(files.projections, open_beam=files.open_beam, views=files.views)
-            if projections.num_masked  # counted anew, in these views alone
+            if projections.num_masked  # read again, to count masked pixels in these views only
             else projections.select(files.views)
         )
         geometry = geometry.select(files.views)
@@ -254,7 +255,7 @@ def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> Registra
 
 @contextmanager
 def _noted() -> Iterator[list[str]]:
-    """The texts of a block's warnings, a line each; at its end, be it an error, they are given once."""
+    """Collect the texts of a block's warnings, a line each, and issue each text once when the block ends or fails."""
     notes: list[str] = []
     caught: list[warnings.WarningMessage] = []
     try:

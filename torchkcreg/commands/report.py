@@ -1,4 +1,4 @@
-"""A folder of results as one page to look at, send and keep: registrations, comparisons, reconstructions."""
+"""Write a results folder (registration, comparison, reconstruction, ...) as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from torchkcreg.io import (
 )
 from torchkcreg.visualization import Page, Row, page_html, png_of
 
-MOST_POINTS = 6000  # of the 3D view
+MOST_POINTS = 6000  # largest number of points in the 3D view
 NAMES = {
     "overlay.png": "Measured views, and the registered implant in them",
     "displacement.png": "Displacement of the implant",
     "history.png": "Course of the registration",
     "slices.png": "Slices of the volume",
-    "beam.png": "The beam behind so much metal, measured and estimated",
+    "beam.png": "Transmission over metal thickness, measured and estimated",
     "compare.png": "Motion between the registrations",
     "densitometry.png": "Bone mineral",
-    "load.png": "What the implant carries",
+    "load.png": "Loads of the implant",
 }
 TABLES = ("compare.json", "densitometry.json", "load.json")
 INTENSITY = {
     "scatter": ("scatter, over the primary", ""),
-    "scatter_removed": ("scatter of what the object takes out of the beam", ""),
+    "scatter_removed": ("scatter, over the removed intensity", ""),
     "blur_sigma_px": ("blur, standard deviation", "pixels"),
-    "hardness": ("filtration beyond the spectrum's", "mm aluminium"),
+    "hardness": ("additional filtration", "mm aluminium"),
 }
 SCALARS = {
     "seconds": ("time", "s", "{:.0f}"),
@@ -50,18 +50,18 @@ SCALARS = {
 
 
 def write_report(folder: Path, *, out: Path | None = None) -> Path:
-    """Writes `report.html` of a folder of results, with all that is in it, and returns its path.
+    """Write `report.html` of a results folder and return its path.
 
-    The page needs no other file and no network: verdict and warnings first, then numbers with their error bars, the
-    implant in three dimensions, the folder's pictures, options and versions.
+    The page needs no other file and no network. It shows verdict and warnings, numbers with error bars, the implant in
+    3D, the folder's figures, options and versions.
 
     Args:
-        folder: of a registration, a comparison, a reconstruction, or what else left `metrics.json` or pictures.
-        out: the page; `report.html` in the folder if None.
+        folder: Folder of a registration, a comparison, a reconstruction, or another one with `metrics.json` or figures.
+        out: Page to write; `report.html` in the folder if None.
 
     Raises:
-        FileNotFoundError: there is no such folder.
-        ValueError: the folder holds no results.
+        FileNotFoundError: If the folder does not exist.
+        ValueError: If the folder holds no results.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -99,7 +99,7 @@ def _kind(folder: Path) -> str:
         "deformation.json": "Registration",
         "volume.mha": "Reconstruction",
         "compare.json": "Comparison",
-        "load.json": "What the implant carries",
+        "load.json": "Loads of the implant",
         "densitometry.json": "Bone mineral",
     }
     return next((kind for name, kind in kinds.items() if (folder / name).is_file()), "Results")
@@ -130,17 +130,17 @@ def _summary(metrics: dict[str, Any]) -> str:
 def _run_rows(metrics: dict[str, Any]) -> list[Row]:
     rows = []
     deviation = metrics.get("node_std_mm")
-    told = f"{deviation:.3f} mm" if isinstance(deviation, float) else ""
+    error = f"{deviation:.3f} mm" if isinstance(deviation, float) else ""
     for key, name in (("mean_motion_mm", "mean motion of the implant"), ("largest_motion_mm", "largest motion")):
         if isinstance(metrics.get(key), float):
-            rows.append(Row(name, f"{metrics[key]:.3f} mm", told, "from the undeformed implant in its frame"))
+            rows.append(Row(name, f"{metrics[key]:.3f} mm", error, "from the undeformed implant in its frame"))
     correlations = [value for value in metrics.get("gc") or [] if isinstance(value, float)]
     if correlations:
         about = "of each view: " + " ".join(f"{value:.3f}" for value in correlations)
         rows.append(Row("gradient correlation, least", f"{min(correlations):.3f}", about=about))
     for name, value in (metrics.get("intensity") or {}).items():
         label, unit = INTENSITY.get(name, (str(name).replace("_", " "), ""))
-        rows.append(Row(label, f"{value:.3g} {unit}".strip(), about="found together with the implant"))
+        rows.append(Row(label, f"{value:.3g} {unit}".strip(), about="estimated together with the implant"))
     return [*rows, *_scalar_rows(metrics)]
 
 
@@ -162,7 +162,7 @@ def _scalar_rows(metrics: dict[str, Any]) -> list[Row]:
 
 
 def _nested_rows(content: Any, prefix: str = "") -> list[Row]:
-    """Numbers of a table's JSON, each under the path that leads to it; `x_std` beside x is its expected error."""
+    """Rows of the numbers in a JSON content, named by their path of keys; `x_std` is shown as the error of `x`."""
     rows: list[Row] = []
     items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
     named = dict(items)
@@ -186,7 +186,7 @@ def _details(folder: Path) -> list[tuple[str, str]]:
 
 
 def _clouds(folder: Path) -> tuple[Tensor, Tensor, Tensor]:
-    """Points (N, 3), their motions (N, 3) and expected errors (N,) of all implants of a run."""
+    """Points (N, 3), their displacements (N, 3) and expected errors (N,) of all implants of a run."""
     tables = [read_point_cloud_ply(path) for path in sorted(folder.glob("*implant_deformed.ply"))]
     if not tables:
         raise ValueError(f"folder {folder} holds no implant_deformed.ply")
@@ -200,7 +200,7 @@ def _clouds(folder: Path) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _layers(folder: Path) -> list[tuple[str, bytes, bytes]]:
-    """Label, measured view and view with the implant of each, as PNG."""
+    """Label, measured view and overlay of each view; images as PNG."""
     held = read_layers(folder / LAYERS)
     if held is None:
         return []
@@ -211,7 +211,7 @@ def _layers(folder: Path) -> list[tuple[str, bytes, bytes]]:
 
 
 def _views(folder: Path) -> ConeBeamGeometry | None:
-    """The registered views, where the geometry's file is still there."""
+    """Geometry of the registered views; None if its file is gone or unreadable."""
     files = read_config(folder / "config.yaml").get("files") if (folder / "config.yaml").is_file() else None
     if not isinstance(files, dict) or not files.get("geometry"):
         return None
@@ -219,19 +219,19 @@ def _views(folder: Path) -> ConeBeamGeometry | None:
         geometry = read_geometry(files["geometry"], projections=files.get("projections"))
         return geometry if files.get("views") is None else geometry.select([int(view) for view in files["views"]])
     except (OSError, ValueError):
-        return None  # moved or changed since; the page does without
+        return None  # moved or changed since; the page omits it
 
 
 def implant_scene(
     points: Tensor, moved: Tensor, std: Tensor, *, views: ConeBeamGeometry | None = None
 ) -> dict[str, Any]:
-    """What the page's 3D view draws: some of the points, how they moved, focal spots and detectors.
+    """Content of the page's 3D view: a sample of the points, their displacements, focal spots and detectors.
 
     Args:
-        points: (N, 3) in world mm, where they are.
-        moved: (N, 3), from where they would be undeformed.
-        std: expected errors (N,), mm.
-        views: focal spots and detectors; none if None.
+        points: Registered points (N, 3), world mm.
+        moved: Displacements (N, 3) from the undeformed shape, mm.
+        std: Expected errors (N,), mm.
+        views: Geometry whose focal spots and detectors are drawn; none if None.
     """
     chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
     volume = float((points.amax(0) - points.amin(0)).clamp_min(0.1).prod())

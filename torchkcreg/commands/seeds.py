@@ -1,4 +1,4 @@
-"""One registration with several seeds: the best of them is the result, and their spread says what chance decided."""
+"""Register with several random seeds: the best run is the result, and the spread shows the effect of chance."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ LARGEST_SPREAD_MM = 0.02
 
 @dataclass(frozen=True)
 class SeedRuns:
-    """Registrations that differ in their seed alone.
+    """Registrations that differ only in their seed.
 
     Attributes:
-        result: The one with the lowest loss at its end.
-        seeds: Seeds in the order in which they ran.
-        losses: Loss of each at its end.
-        distances_mm: RMS over the implant's nodes of the distance of each run's nodes from their mean over the runs.
+        result: Result of the run with the lowest final loss.
+        seeds: Seeds in the order of the runs.
+        losses: Final loss of each run.
+        distances_mm: Distance of each run's nodes from their mean over all runs, RMS over the nodes.
     """
 
     result: RegistrationResult
@@ -38,11 +38,11 @@ class SeedRuns:
 
     @property
     def spread_mm(self) -> float:
-        """The largest of the distances: no run ended farther from the others' mean."""
+        """Largest distance of a run from the mean of the runs, mm."""
         return max(self.distances_mm)
 
     def to_dict(self) -> dict[str, Any]:
-        """What metrics.json keeps."""
+        """Content of metrics.json under `seeds`."""
         return {
             "spread_mm": self.spread_mm,
             "best_seed": self.result.seed,
@@ -69,41 +69,41 @@ def register_seeds(
     overwrite: bool = False,
     figures: bool = True,
 ) -> SeedRuns:
-    """A registration with each of several seeds: the configuration's, the next one, and so on.
+    """Register with several consecutive seeds, starting with that of the configuration.
 
-    Each run is kept in a run folder of its own, ``out/seeds/<seed>``, without pictures. The one with the lowest loss is
-    ``out`` itself, whose ``metrics.json`` has the spread under ``seeds``. A spread above 0.02 mm is warned of.
+    Each run is written to `out/seeds/<seed>`, without figures. The run with the lowest loss is also written to `out`,
+    whose `metrics.json` has the spread under `seeds`. A spread above 0.02 mm gives a warning.
 
     Args:
-        files: What is registered to what.
+        files: Input files: implants, geometry, projections, ...
         out: Run folder.
-        num_seeds: How many.
-        overrides: Options that override those of ``files.config``.
-        overwrite: Replace a run that is there, with the seeds it kept.
+        num_seeds: Number of seeds.
+        overrides: Options that override those of `files.config`.
+        overwrite: Replace an existing run and its seeds.
         figures: Draw the best run.
 
     Raises:
-        ValueError: If there is no seed to run, or files or options are wrong.
+        ValueError: If `num_seeds` is below 1, or files or options are wrong.
         FileNotFoundError: If a file is missing.
-        FileExistsError: If ``out`` holds a run that is not to be replaced.
+        FileExistsError: If `out` holds a run and `overwrite` is False.
     """
     if num_seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {num_seeds}")
     start = time.perf_counter()
     config = resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
-    prepared_trainer(inputs, config)  # refuses what cannot be registered before anything is written
+    prepared_trainer(inputs, config)  # raises on bad inputs before anything is written
     run = RunFolder.create(out, overwrite=overwrite)
     run.start(run_record(files, config))
     trainers: list[Trainer] = []
     results: list[RegistrationResult] = []
     for seed in range(config.seed, config.seed + num_seeds):
-        own, begin = config.model_copy(update={"seed": seed}), time.perf_counter()
-        trainers.append(prepared_trainer(inputs, own))
+        seed_config, seed_start = config.model_copy(update={"seed": seed}), time.perf_counter()
+        trainers.append(prepared_trainer(inputs, seed_config))
         folder = run.of_seed(seed)
-        folder.start(run_record(files, own))
+        folder.start(run_record(files, seed_config))
         results.append(train(trainers[-1], folder, inputs))
-        write_run(folder, results[-1], trainers[-1], inputs, seconds=time.perf_counter() - begin, figures=False)
+        write_run(folder, results[-1], trainers[-1], inputs, seconds=time.perf_counter() - seed_start, figures=False)
     losses = tuple(float(result.history[-1]["loss"]) for result in results)
     best = losses.index(min(losses))
     nodes = torch.stack([_all_nodes(result, inputs) for result in results])
@@ -121,14 +121,19 @@ def register_seeds(
 
 def _all_nodes(result: RegistrationResult, inputs: RegistrationInputs) -> Tensor:
     """World positions (N, 3) of all implants' nodes."""
-    return torch.cat([i.warp(given.cloud.points) for i, given in zip(result.implants, inputs.implants, strict=True)])
+    return torch.cat(
+        [
+            registered.warp(undeformed.cloud.points)
+            for registered, undeformed in zip(result.implants, inputs.implants, strict=True)
+        ]
+    )
 
 
 def distances_from_mean(nodes: Tensor) -> Tensor:
-    """RMS over the nodes of the distance of each run's from their mean over the runs, shape (R,).
+    """Distance of each run's nodes from their mean over the runs, RMS over the nodes, shape (R,).
 
     Args:
-        nodes: positions (R, N, 3), mm.
+        nodes: Node positions of each run (R, N, 3), mm.
 
     >>> distances_from_mean(torch.tensor([[[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.5]]])).tolist()
     [0.25, 0.25]
@@ -137,11 +142,14 @@ def distances_from_mean(nodes: Tensor) -> Tensor:
 
 
 def _warn(runs: SeedRuns, known: int) -> None:
-    """Gives the best run's own warnings, and one of a large spread, which the result keeps."""
+    """Issue the best run's warnings after the first `known` (those of the inputs), which are already issued.
+
+    A large spread adds a warning to the result, and makes an "ok" result "doubtful".
+    """
     if runs.spread_mm > LARGEST_SPREAD_MM:
         runs.result.warnings.append(
             f"{len(runs.seeds)} seeds end up to {runs.spread_mm:.3f} mm from their mean (RMS over nodes), more than "
-            f"{LARGEST_SPREAD_MM:g} mm: the views do not settle the result"
+            f"{LARGEST_SPREAD_MM:g} mm: the views do not determine the result"
         )
         if runs.result.status == "ok":
             runs.result.status = "doubtful"

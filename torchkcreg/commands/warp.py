@@ -1,4 +1,4 @@
-"""Move points of a registered implant: from its own frame, before the motion, to the world."""
+"""Map points from the undeformed implant's frame to the world."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torchkcreg.io import read_points, read_run, write_points
 
 
 def warp_files(run_folder: Path, points_file: Path, out: Path, *, implant_name: str | None = None) -> Tensor:
-    """Write the points in the world, mm, with their expected errors; return which lie beyond the implant's reach (N,).
+    """Write the points in the world, mm, with expected errors; return a mask (N,) of points beyond the implant's reach.
 
     Args:
-        run_folder: Of a finished registration.
+        run_folder: Folder of a finished registration.
         points_file: Table of x, y, z in the undeformed implant's frame, mm.
-        out: Table to write: x, y, z in the world, `outside`, and `lateral_std_mm` and `depth_std_mm` where known.
-        implant_name: Of several implants, the one whose frame the points are in.
+        out: Table to write: x, y, z in the world, `outside`, and `lateral_std_mm`, `depth_std_mm` if the run has them.
+        implant_name: Name of the implant to which the points belong, if the run has several.
 
     Raises:
         ValueError: If the run has no implant of that name, or a file cannot be read.

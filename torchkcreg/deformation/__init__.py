@@ -1,6 +1,8 @@
-"""How an implant bends: what a registration needs of a deformation (`Deformation`, `Motion`), and the models behind it.
-A free-form deformation has groups of control points that move rigidly or along elastic modes. Displacements of control
-points are in the grid's axes, points and fields in the implant's frame.
+"""Deformation models of an implant, and the interface that a registration uses (`Deformation`, `Motion`).
+
+There are rigid, linear, finite-element and free-form deformations. In a free-form deformation, groups of control points
+move rigidly or along elastic modes. Displacements of control points are given in the grid's axes, points and
+displacement fields in the implant's frame.
 """
 
 from .deformation import Deformation, Level, Motion, combined

@@ -1,4 +1,4 @@
-"""The elastic energy of an implant whose groups of control points move."""
+"""Elastic energy of an implant that is deformed by groups of control points."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .groups import group_moment_gradients, moment_features
 def strain_energy(gradients: Tensor, volumes: Tensor, *, poisson: float = 0.0) -> Tensor:
     """Mean elastic energy density per unit of Young's modulus, shape (...), of a Saint Venant-Kirchhoff solid.
 
-    ``lambda / 2 tr(E)^2 + mu E : E`` with the Green-Lagrange strain ``E = (F^T F - I) / 2``, which no rigid motion
-    changes, however large: a bent plate whose ends turn by degrees is charged for its bending alone. A plate of
-    thickness h bent to curvature k has ``(k h)^2 / 24``.
+    `lambda / 2 tr(E)^2 + mu E : E` with the Green-Lagrange strain `E = (F^T F - I) / 2`. This strain is
+    invariant under rigid motions of any size, so that large rotations of a plate's ends cost nothing beyond the bending
+    itself. A plate of thickness h bent to curvature k has `(k h)^2 / 24`.
 
     Args:
         gradients: Deformation gradients F at the nodes, shape (..., N, 3, 3).
         volumes: Volumes of the nodes, shape (N,), mm^3.
-        poisson: Poisson's ratio. Zero suits control points that move in rigid groups: those cannot contract sideways,
-            and would make an implant that wants to look stiffer than it is.
+        poisson: Poisson's ratio. Use zero for control points that move in rigid groups: these cannot contract
+            laterally, and a positive ratio would make the implant appear too stiff.
 
     Raises:
         ValueError: If poisson is not from 0 up to, but not including, 0.5.
@@ -45,12 +45,12 @@ def strain_energy(gradients: Tensor, volumes: Tensor, *, poisson: float = 0.0) -
 class Elasticity:
     """Strains and displacements of an implant under motions of groups of control points.
 
-    Motions are given as `motion_coefficients`, (K, 4 G, 3) in the grid's axes.
+    Motions are given in the form of `motion_coefficients`, (K, 4 G, 3) in the grid's axes.
 
     Args:
         grid: Control points.
         labels: Group of each control point.
-        points: Nodes of the implant, shape (N, 3); bending is smooth, a few thousand give its integral.
+        points: Nodes of the implant, shape (N, 3). Bending is smooth, so a few thousand suffice for the integral.
         volumes: Their volumes, shape (N,), mm^3.
     """
 
@@ -63,7 +63,7 @@ class Elasticity:
         self.share = (self.volumes / self.volumes.sum()).sqrt()
 
     def of_filling(self) -> Elasticity:
-        """The same for a solid that fills the grid's valid domain, one node a cell."""
+        """The same for a solid that fills the grid's valid domain, with one node per cell."""
         cells = self.grid.positions()[1:-2, 1:-2, 1:-2].reshape(-1, 3)
         spacing = torch.tensor(self.grid.spacing, dtype=torch.float64, device=self.grid.frame.device)
         middles = transform_points(self.grid.frame, cells + spacing / 2)
@@ -71,7 +71,7 @@ class Elasticity:
 
     @property
     def volume(self) -> float:
-        """Of the implant, mm^3."""
+        """Volume of the implant, mm^3."""
         return float(self.volumes.sum())
 
     def gradients(self, steps: Tensor) -> Tensor:
@@ -79,22 +79,22 @@ class Elasticity:
         return torch.eye(3, dtype=steps.dtype, device=steps.device) + (self.slopes @ steps[:, None]).mT
 
     def energy(self, steps: Tensor) -> Tensor:
-        """Mean energy density over Young's modulus, shape (K,); half a squared strain."""
+        """Mean energy density over Young's modulus, shape (K,): half the mean squared strain."""
         return strain_energy(self.gradients(steps), self.volumes)
 
     def stiffness(self, slopes: Tensor) -> Tensor:
         """Second derivatives (D, D) of the energy at rest along D directions, given as slopes (D, 4 G, 3).
 
-        Strains ``(H + H^T) / 2`` of small gradients H have the squares ``(H : H + H : H^T) / 2``, and H is linear in a
-        few numbers: what the implant's nodes add is summed once, over them alone.
+        The squared strain `(H + H^T) / 2` of a small gradient H is `(H : H + H : H^T) / 2`, and H is linear in the 4 G
+        coefficients. The sum over the nodes is therefore computed once, for products of coefficients.
         """
-        weighed = self.slopes * self.share[:, None, None]  # (N, 3, 4 G): by the grid's axis, then by the number
-        among = torch.einsum("njf,nkg->jkfg", weighed, weighed)  # axes j and k, numbers f and g
-        straight = torch.einsum("jjfg->fg", among)
-        first = torch.einsum("dfi,fg,egi->de", slopes, straight, slopes)
-        second = torch.einsum("dfk,jkfg,egj->de", slopes, among, slopes)
+        weighted = self.slopes * self.share[:, None, None]  # (N, 3, 4 G): grid axis, coefficient
+        products = torch.einsum("njf,nkg->jkfg", weighted, weighted)  # axes j and k, coefficients f and g
+        same_axis = torch.einsum("jjfg->fg", products)
+        first = torch.einsum("dfi,fg,egi->de", slopes, same_axis, slopes)
+        second = torch.einsum("dfk,jkfg,egj->de", slopes, products, slopes)
         return 0.5 * (first + second)
 
     def displacements(self, steps: Tensor) -> Tensor:
-        """Displacements, (K, 3 N), so weighted that their squares sum to the mean square, mm^2."""
+        """Displacements (K, 3 N), mm, weighted so that their squares sum to the mean square displacement."""
         return (combined(self.moments, steps) * self.share[:, None]).flatten(1)

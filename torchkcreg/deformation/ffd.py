@@ -18,13 +18,13 @@ class FreeFormDeformation(SplineField):
     """Free-form deformation x -> x + u(x) of points in the implant's frame.
 
     Args:
-        grid: control points (CPs).
-        control_points: initial displacements, mm, in the grid's axes, shape (nx, ny, nz, 3); zero if not given.
-        labels: group of each CP, shape (nx, ny, nz); one group if not given.
-        prior: what speaks against bending.
+        grid: Control points (CPs).
+        control_points: Initial displacements, mm, in the grid's axes, shape (nx, ny, nz, 3); zero if not given.
+        labels: Group of each CP, shape (nx, ny, nz); one group if not given.
+        prior: Weights of the penalties on bending; default weights if not given.
 
     Raises:
-        ValueError: if shapes do not fit.
+        ValueError: If shapes do not fit.
 
     Example:
         >>> import torch
@@ -49,12 +49,12 @@ class FreeFormDeformation(SplineField):
         self.prior = prior or BendingPrior()
 
     def motion(self, cloud: ImplantPointCloud, level: Level) -> Motion:
-        """Motions of groups of control points, each freely or together along elastic modes.
+        """Motions of groups of control points, either each group freely or all together along elastic modes.
 
-        An implant that spans fewer control points than there should be groups has as many groups as it can.
+        An implant that spans fewer control points than the level has groups gets as many groups as possible.
 
         Raises:
-            ValueError: If the level has fewer groups than there are so far: they could not hold their bending.
+            ValueError: If the level has fewer groups than the current deformation: its bending would be lost.
         """
         if level.groups < self.num_groups:
             raise ValueError(

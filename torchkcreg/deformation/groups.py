@@ -1,8 +1,8 @@
-"""Groups of control points that move rigidly: their motions, and what nodes need to follow them.
+"""Groups of control points that move rigidly: clustering, motions, and the resulting displacements of nodes.
 
 Group g turns by R_g about its centre c_g and shifts by t_g: phi_c = (R_g - I)(c - c_g) + t_g. A spline is linear in
-phi, so a node moves by sum_g W_g t_g + (R_g - I) M_g, with moments W_g and M_g that depend on its reference position
-only. Everything here is in the axes of the grid's frame.
+phi, so a node moves by sum_g W_g t_g + (R_g - I) M_g, where the moments W_g and M_g depend only on its reference
+position. Everything here is in the axes of the grid's frame. CP is short for control point.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from torch.nn.functional import one_hot
 from torchkcreg.splines.basis import SplineBasis
 from torchkcreg.splines.grid import ControlPointGrid
 
-# A CP that carries less than this share of the most loaded one has no implant near it: it hardly moves a node, and
-# must not attract cuts.
+# A CP that carries less than this share of the volume of the most loaded one has no implant near it. It hardly moves a
+# node and must not influence the cuts.
 _LEAST_LOAD = 1e-3
 
 
 def control_point_volumes(grid: ControlPointGrid, points: Tensor, volumes: Tensor) -> Tensor:
     """Implant volume that each control point carries, sum_n m_n B_c(x_n), mm^3, shape (nx, ny, nz), float64.
 
-    They add up to the implant's volume; what a CP beyond the grid would carry counts to the nearest real one.
+    They add up to the implant's volume. The volume of a CP beyond the grid is added to the nearest CP of the grid.
 
     Args:
-        grid: control points.
-        points: nodes in the implant's frame, mm, shape (N, 3).
-        volumes: of the nodes, mm^3, shape (N,).
+        grid: Control points.
+        points: Nodes in the implant's frame, mm, shape (N, 3).
+        volumes: Volumes of the nodes, mm^3, shape (N,).
 
     Raises:
-        ValueError: if shapes do not fit.
+        ValueError: If shapes do not fit.
 
     Example:
         >>> grid = ControlPointGrid((4, 4, 4), (10.0, 10.0, 10.0), torch.eye(4))
@@ -49,18 +49,19 @@ def control_point_volumes(grid: ControlPointGrid, points: Tensor, volumes: Tenso
 def cluster_control_points(grid: ControlPointGrid, weights: Tensor, num_groups: int) -> Tensor:
     """Group (0 to G - 1) of each control point, shape (nx, ny, nz), long.
 
-    From one group on, the group with the largest extent along its principal direction is cut in two across it, where
-    the two parts' spread about their own centres is least (Otsu's criterion), until there are enough. Extents,
-    directions and spreads are weighted. The cuts for g + 1 groups begin with those for g: groups are refined, and
-    only the new one has a new number. Control points with no implant near join the nearest one that has.
+    Starting from one group, the group with the largest extent along its principal direction is repeatedly cut in two
+    across that direction, at the place that minimises the spread of the two parts about their centres (Otsu's
+    criterion). Extents, directions and spreads are weighted. The cuts for g + 1 groups begin with those for g: groups
+    are refined, and only the new group gets a new number. Control points far from the implant join the group of the
+    nearest one that carries implant.
 
     Args:
-        grid: control points.
-        weights: implant volume that each CP carries (`control_point_volumes`), not negative, shape (nx, ny, nz).
+        grid: Control points.
+        weights: Implant volume that each CP carries (`control_point_volumes`), not negative, shape (nx, ny, nz).
         num_groups: G, at least 1.
 
     Raises:
-        ValueError: if shapes do not fit, weights are negative or all zero, or there are fewer loaded CPs than groups.
+        ValueError: If shapes do not fit, weights are negative or all zero, or there are fewer loaded CPs than groups.
 
     Example:
         >>> grid = ControlPointGrid((4, 4, 10), (10.0, 10.0, 20.0), torch.eye(4))
@@ -78,7 +79,7 @@ def cluster_control_points(grid: ControlPointGrid, weights: Tensor, num_groups: 
     groups = torch.zeros_like(loaded)
     extents = [_principal_extent(positions, load)]
     for new in range(1, num_groups):
-        # Rounded, so that equal halves of a symmetric implant are cut in the same order everywhere.
+        # Rounded, so that equal halves of a symmetric implant are cut in the same order on all machines.
         widest = max(range(new), key=lambda group: round(extents[group], 6))
         members = (groups == widest).nonzero().squeeze(-1)
         groups[members[_upper_part(positions[members], load[members])]] = new
@@ -89,7 +90,7 @@ def cluster_control_points(grid: ControlPointGrid, weights: Tensor, num_groups: 
 
 
 def carrying(weights: Tensor) -> Tensor:
-    """True for control points with implant near them, in the shape of their weights: as many as there can be groups."""
+    """True for control points near the implant, in the shape of their weights; their number bounds that of groups."""
     return weights >= _LEAST_LOAD * weights.max()
 
 
@@ -101,7 +102,7 @@ def _principal_extent(positions: Tensor, load: Tensor) -> float:
 
 
 def _upper_part(positions: Tensor, load: Tensor) -> Tensor:
-    """True for the points beyond the best cut across the principal direction; both parts hold some."""
+    """True for the points beyond the best cut across the principal direction; neither part is empty."""
     direction = torch.linalg.eigh(_covariance(positions, load)).eigenvectors[:, -1]
     direction = direction * torch.where(direction[direction.abs().argmax()] < 0, -1.0, 1.0)
     along = (positions - positions.mean(0)) @ direction
@@ -126,11 +127,11 @@ def group_centers(grid: ControlPointGrid, labels: Tensor) -> Tensor:
     """Mean position (G, 3) of each group's control points in the grid's frame, mm, float64.
 
     Args:
-        grid: control points.
-        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        grid: Control points.
+        labels: Group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
 
     Raises:
-        ValueError: if labels have another shape, are negative or leave a group out.
+        ValueError: If labels have another shape, are negative or leave a group out.
     """
     _check_labels(grid, labels)
     members = one_hot(labels.flatten()).T.double()
@@ -152,17 +153,18 @@ def group_moments(
     """Moments W (N, G) and M (N, G, 3) of the B-spline weights at each point, by group.
 
     W_g(x) = sum_{c in g} B_c(x) and M_g(x) = sum_{c in g} B_c(x) (c - c_g), mm, about the groups' centres, in the
-    grid's axes. CPs beyond the grid count to the group of the nearest real CP. Both are views of one (N, 4 G) tensor.
+    grid's axes. CPs beyond the grid belong to the group of the nearest CP of the grid. Both results are views of one
+    (N, 4 G) tensor.
 
     Args:
-        grid: control points.
-        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
-        points: in the implant's frame, mm, shape (N, 3).
-        num_groups: G, checked if given.
-        dtype: of the work and the result; the points' own if not given.
+        grid: Control points.
+        labels: Group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        points: Points in the implant's frame, mm, shape (N, 3).
+        num_groups: Number of groups G, checked if given.
+        dtype: Dtype of the computation and the result; that of the points if not given.
 
     Raises:
-        ValueError: if shapes or groups do not fit.
+        ValueError: If shapes or groups do not fit.
 
     Example:
         >>> grid = ControlPointGrid((4, 4, 4), (10.0, 10.0, 10.0), torch.eye(4))
@@ -181,15 +183,15 @@ def group_moments(
 
 
 def group_moment_gradients(grid: ControlPointGrid, labels: Tensor, points: Tensor) -> Tensor:
-    """Gradients (N, 3, G, 4) of the moments along the grid's axes, 1/mm and 1: of W_g, then of the three of M_g.
+    """Gradients (N, 3, G, 4) of the moments along the grid's axes: of W_g (1/mm), then of the three of M_g (1).
 
-    The displacement's gradient is linear in the groups' motions as the displacement is: d u / d x_j = sum_g t_g d_j W_g
-    + (R_g - I) d_j M_g.
+    Like the displacement, its gradient is linear in the groups' motions:
+    d u / d x_j = sum_g t_g d_j W_g + (R_g - I) d_j M_g.
 
     Args:
-        grid: control points.
-        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
-        points: in the implant's frame, mm, shape (N, 3).
+        grid: Control points.
+        labels: Group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        points: Points in the implant's frame, mm, shape (N, 3).
     """
     centers = group_centers(grid, labels)
     basis = SplineBasis(grid, points)
@@ -201,7 +203,7 @@ def group_moment_gradients(grid: ControlPointGrid, labels: Tensor, points: Tenso
 
 
 def _cell_moments(grid: ControlPointGrid, labels: Tensor, basis: SplineBasis, centers: Tensor) -> Tensor:
-    """Membership and arm of the CPs of each cell, (num_cells, 64, 4 G): what the moments are sums of."""
+    """Group membership and offset from the group centre of each cell's CPs, (num_cells, 64, 4 G); moments sum these."""
     indices, nearest = basis.control_points()
     member = one_hot(labels.to(indices.device).flatten()[nearest], len(centers)).double()
     spacing = torch.tensor(grid.spacing, dtype=torch.float64, device=indices.device)
@@ -210,20 +212,20 @@ def _cell_moments(grid: ControlPointGrid, labels: Tensor, basis: SplineBasis, ce
 
 
 def moment_features(grid: ControlPointGrid, labels: Tensor, points: Tensor) -> Tensor:
-    """Moments (N, 4 G), float64, of points (N, 3): W_g, then the three of M_g, one group after the other.
+    """Moments (N, 4 G), float64, of points (N, 3): per group W_g, then the three of M_g.
 
-    Displacements in the grid's axes are ``moment_features @ motion_coefficients``, for all candidates at once.
+    Displacements in the grid's axes are `moment_features @ motion_coefficients`, for all candidates at once.
     """
     shares, moments = group_moments(grid, labels, points.double())
     return torch.cat([shares[..., None], moments], dim=-1).flatten(1)
 
 
 def motion_coefficients(rotations: Tensor, translations: Tensor) -> Tensor:
-    """Motions (..., 4 G, 3) of groups as `moment_features` multiply them: t_g, then R_g - I, in the grid's axes.
+    """Coefficients (..., 4 G, 3) of group motions for `moment_features`: t_g, then R_g - I, in the grid's axes.
 
     Args:
-        rotations: of the groups about their centres, (..., G, 3, 3).
-        translations: of the groups' centres, mm, (..., G, 3).
+        rotations: Rotations of the groups about their centres, (..., G, 3, 3).
+        translations: Translations of the groups' centres, mm, (..., G, 3).
     """
     turns = (rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).mT
     return torch.cat([translations[..., None, :], turns], dim=-2).flatten(-3, -2)
@@ -237,10 +239,10 @@ def control_points_from_groups(
     phi_c = (R_g - I)(c - c_g) + t_g.
 
     Args:
-        grid: control points.
-        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
-        rotations: of the groups about their centres, (..., G, 3, 3).
-        translations: of the groups' centres, mm, (..., G, 3).
+        grid: Control points.
+        labels: Group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        rotations: Rotations of the groups about their centres, (..., G, 3, 3).
+        translations: Translations of the groups' centres, mm, (..., G, 3).
     """
     centers = group_centers(grid, labels).to(translations)
     _check_motions(rotations, translations, len(centers))

@@ -1,4 +1,4 @@
-"""Deformations that are linear in a few amounts, turned and shifted as a whole: rigid ones, modes, superelements."""
+"""Rigid deformations, and deformations that are linear in a few amounts, with their motions."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from .deformation import Deformation, Level, Motion
 
 
 class RigidMotion(Motion):
-    """Three rotations about an implant's middle, times its radius of gyration, and three translations, all in mm.
+    """Three rotations about an implant's centre of mass, times its radius of gyration, and three translations, in mm.
 
     Args:
-        deformation: How the implant is bent; it stays so.
+        deformation: Deformation of the implant; it stays unchanged.
         cloud: The implant.
     """
 
@@ -31,25 +31,25 @@ class RigidMotion(Motion):
         self.radius = (share * (points - self.center) ** 2).sum().sqrt()
 
     def features(self, points: Tensor) -> Tensor:
-        """1, x + u(x) - c, u(x)."""
+        """Features 1, x + u(x) - c, u(x)."""
         points = points.double()
         with torch.no_grad():
             moved = self.deformation.displacement(points)
         return torch.cat([torch.ones_like(points[..., :1]), points + moved - self.center, moved], dim=-1)
 
     def coefficients(self, steps: Tensor) -> Tensor:
-        """t, R - I, I."""
+        """Coefficients t, R - I, I."""
         turn, shift = self.turn_and_shift(steps)
-        same = torch.eye(3, dtype=turn.dtype, device=turn.device).expand_as(turn)
-        return torch.cat([shift[:, None], turn.mT - same, same], dim=1)
+        identity = torch.eye(3, dtype=turn.dtype, device=turn.device).expand_as(turn)
+        return torch.cat([shift[:, None], turn.mT - identity, identity], dim=1)
 
     def turn_and_shift(self, steps: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (K, 3, 3) about the middle, and shifts (K, 3) of it."""
+        """Rotations (K, 3, 3) about the centre of mass, and shifts (K, 3) of it."""
         return rotation_from_vector(steps[:, :3] / self.radius), steps[:, 3:6]
 
     @torch.no_grad()
     def accept(self, steps: Tensor) -> Tensor:
-        """The rotation and translation."""
+        """Rigid motion (4, 4) of the steps."""
         turn, shift = self.turn_and_shift(steps[None].double())
         motion = rigid_matrix(torch.zeros_like(self.center), self.center + shift[0] - turn[0] @ self.center)
         motion[:3, :3] = turn[0]
@@ -57,10 +57,10 @@ class RigidMotion(Motion):
 
 
 class LinearDeformation(Deformation):
-    """Displacements ``u(x) = sum_m q_m shape_m(x)``; override :meth:`shapes`, and maybe :meth:`prior`.
+    """Displacements `u(x) = sum_m q_m shape_m(x)`. Subclasses override `shapes` and, if needed, `prior`.
 
     Args:
-        num_amounts: M, how many shapes there are. A shape should move the implant by about 1 mm.
+        num_amounts: Number of shapes M. An amount of one should move the implant by about 1 mm.
 
     Attributes:
         amounts: Parameter q (M,), float64.
@@ -83,11 +83,11 @@ class LinearDeformation(Deformation):
         self.amounts = nn.Parameter(torch.zeros(num_amounts, dtype=torch.float64, device="cpu"))
 
     def shapes(self, points: Tensor) -> Tensor:
-        """Displacements (..., N, M, 3) of points (..., N, 3) by an amount of one of each shape, mm."""
+        """Displacements (..., N, M, 3) of points (..., N, 3) for an amount of one of each shape, mm."""
         raise NotImplementedError
 
     def prior(self, amounts: Tensor) -> Tensor:
-        """What speaks against amounts (K, M) but the images, in units of the loss, shape (K,); nothing by default."""
+        """Prior of amounts (K, M), shape (K,), in units of the loss; zero by default."""
         return amounts.new_zeros(amounts.shape[:-1])
 
     def displacement(self, points: Tensor) -> Tensor:
@@ -109,23 +109,23 @@ class RigidDeformation(LinearDeformation):
         super().__init__(0)
 
     def shapes(self, points: Tensor) -> Tensor:
-        """None, (..., N, 0, 3)."""
+        """No shapes, (..., N, 0, 3)."""
         return points.new_zeros(*points.shape[:-1], 0, 3)
 
     def to_dict(self) -> dict[str, Any]:
-        """Nothing but the model's name."""
+        """The model's name only."""
         return {"model": self.model}
 
 
 class LinearMotion(Motion):
-    """Rotation and translation of the whole implant, all in mm, and changes of a linear deformation's amounts.
+    """Rotation and translation of the whole implant, in mm, and changes of a linear deformation's amounts.
 
-    ``x + u(x)`` becomes ``R (x + sum_m q_m shape_m(x) - c) + c + t``: the shapes turn with the implant.
+    `x + u(x)` becomes `R (x + sum_m q_m shape_m(x) - c) + c + t`: the shapes turn with the implant.
 
     Args:
-        deformation: Where the motion starts.
-        cloud: The implant; its middle is c, and its radius of gyration makes millimetres of angles.
-        free: Whether the amounts may change.
+        deformation: Deformation from which the motion starts.
+        cloud: The implant. Its centre of mass is c, and its radius of gyration converts angles to millimetres.
+        free: If False, the amounts stay fixed.
     """
 
     def __init__(self, deformation: LinearDeformation, cloud: ImplantPointCloud, *, free: bool) -> None:
@@ -138,14 +138,14 @@ class LinearMotion(Motion):
         self.num_parameters = 6 + (len(self.start) if free else 0)
 
     def features(self, points: Tensor) -> Tensor:
-        """1, x - c, then the shapes' three components, one shape after the other."""
+        """Features 1, x - c, then the three components of each shape."""
         points = points.double()
         with torch.no_grad():
             shapes = self.deformation.shapes(points).flatten(-2)
         return torch.cat([torch.ones_like(points[..., :1]), points - self.center, shapes], dim=-1)
 
     def coefficients(self, steps: Tensor) -> Tensor:
-        """t, then R - I, then q_m R for each shape."""
+        """Coefficients t, then R - I, then q_m R for each shape."""
         rotation, turned = self._rotation(steps), self._rotation(steps).mT
         rigid = torch.cat(
             [steps[:, None, 3:6], turned - torch.eye(3, dtype=rotation.dtype, device=rotation.device)], dim=1
@@ -154,12 +154,12 @@ class LinearMotion(Motion):
         return torch.cat([rigid, (amounts[..., None, None] * turned[:, None]).flatten(1, 2)], dim=1)
 
     def penalty(self, steps: Tensor) -> Tensor:
-        """The deformation's prior."""
+        """Prior of the amounts."""
         return self.deformation.prior(self._amounts(steps))
 
     @torch.no_grad()
     def accept(self, steps: Tensor) -> Tensor:
-        """The rotation and translation; the amounts have gone into the deformation."""
+        """Store the amounts in the deformation and return the rotation and translation (4, 4)."""
         self.deformation.amounts.copy_(self._amounts(steps[None])[0])
         turn = self._rotation(steps[None])[0]
         shift = self.center + steps[3:6].double() - turn @ self.center

@@ -1,4 +1,4 @@
-"""Diffusion penalty of control points (eq. 5 of Cao et al. 2020)."""
+"""Penalty on bending of a free-form deformation: diffusion penalty (eq. 5 of Cao et al. 2020) and the weights."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from torchkcreg.splines.grid import ControlPointGrid
 
 @dataclass(frozen=True)
 class BendingPrior:
-    """Weights of what speaks against a free-form deformation, in units of the loss.
+    """Weights of the penalties on a free-form deformation, in units of the loss.
 
     Attributes:
-        beta: Of the diffusion penalty (eq. 5 of Cao et al. 2020), where groups move freely.
-        stiffness: Of the implant's elastic energy, as its mean density over Young's modulus, where groups move freely.
-        load_weight: Loss for a load of 1 kN along an elastic mode; it grows with the load's square.
+        beta: Weight of the diffusion penalty (eq. 5 of Cao et al. 2020), if groups move freely.
+        stiffness: Weight of the implant's elastic energy (mean density over Young's modulus), if groups move freely.
+        load_weight: Loss for a load of 1 kN along an elastic mode; it grows with the square of the load.
         youngs_modulus_gpa: Young's modulus of the implant, GPa.
     """
 
@@ -31,17 +31,18 @@ class BendingPrior:
 def diffusion_penalty(control_points: Tensor, grid: ControlPointGrid, *, remove_rigid: bool = True) -> Tensor:
     """Diffusion penalty R of control-point displacements, mm^3, shape (...) (eq. 5 of Cao et al. 2020).
 
-    R = sum ||grad phi||^2 dx dy dz / (nx ny nz), with forward differences in mm inside the grid: central ones would
-    let a checkerboard pass. The best rigid motion is taken out of phi first, because turning the whole implant by one
-    degree would otherwise cost about 1, where 1e-4 of gradient correlation decides 0.1 mm of depth.
+    R = sum ||grad phi||^2 dx dy dz / (nx ny nz), with forward differences in mm inside the grid (central
+    differences would not penalise a checkerboard pattern). The best rigid motion is removed from phi first. Otherwise a
+    rotation of the whole implant by one degree would cost about 1, whereas a difference of 1e-4 in gradient correlation
+    decides 0.1 mm of depth.
 
     Args:
-        control_points: displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
-        grid: control points.
-        remove_rigid: False takes phi as it is.
+        control_points: Displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
+        grid: Control points.
+        remove_rigid: If False, phi is used as it is.
 
     Raises:
-        ValueError: if shapes do not fit.
+        ValueError: If shapes do not fit.
 
     Example:
         >>> import torch
@@ -58,13 +59,13 @@ def diffusion_penalty(control_points: Tensor, grid: ControlPointGrid, *, remove_
 
 
 def without_rigid(control_points: Tensor, grid: ControlPointGrid) -> Tensor:
-    """Displacements phi' (..., nx, ny, nz, 3) that remain when the best common rigid motion has been undone.
+    """Displacements phi' (..., nx, ny, nz, 3) after removal of the best common rigid motion.
 
     phi'_c = C^-1 (c + phi_c) - c with C the least-squares fit of c -> c + phi_c over all control points.
 
     Args:
-        control_points: displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
-        grid: control points.
+        control_points: Displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
+        grid: Control points.
     """
     positions = grid.positions().to(control_points).reshape(-1, 3)
     moved = positions + control_points.flatten(-4, -2)

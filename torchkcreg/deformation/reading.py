@@ -1,4 +1,4 @@
-"""Deformations out of the plain types that files hold."""
+"""Reads deformations from the plain types stored in files."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .linear import RigidDeformation
 
 
 def deformation_from_dict(content: Any) -> Deformation:
-    """The deformation that `Deformation.to_dict` described, in float64; a new model is a line in the table below.
+    """Inverse of `Deformation.to_dict`, in float64. To add a model, add a line to the table `_READERS`.
 
     Raises:
-        ValueError: a key is missing or malformed; the message names it.
+        ValueError: If a key is missing or malformed; the message names it.
     """
     require_keys(content, ("model",), " of a deformation")
     if content["model"] not in _READERS:

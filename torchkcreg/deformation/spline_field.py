@@ -15,20 +15,20 @@ from .deformation import Deformation
 
 
 class SplineField(Deformation):
-    """The displacement field of a lattice of control points, as a module: eq. 2 of Cao et al. 2020.
+    """Displacement field of a lattice of control points, as a module (eq. 2 of Cao et al. 2020).
 
     Args:
-        grid: control points (CPs).
-        control_points: initial displacements, mm, in the grid's axes, shape (nx, ny, nz, 3); zero if not given.
-        labels: group of each CP, shape (nx, ny, nz); one group if not given. Only the continuation beyond the grid
+        grid: Control points (CPs).
+        control_points: Initial displacements, mm, in the grid's axes, shape (nx, ny, nz, 3); zero if not given.
+        labels: Group of each CP, shape (nx, ny, nz); one group if not given. Only the extrapolation beyond the grid
             depends on it.
 
     Raises:
-        ValueError: if shapes do not fit.
+        ValueError: If shapes do not fit.
 
     Attributes:
-        control_points: parameter phi, (nx, ny, nz, 3), float64 unless given otherwise.
-        labels: buffer (nx, ny, nz), long.
+        control_points: Parameter phi, (nx, ny, nz, 3), float64 unless another dtype is given.
+        labels: Buffer (nx, ny, nz), long.
     """
 
     labels: Tensor
@@ -74,25 +74,25 @@ class SplineField(Deformation):
         return jacobian.reshape(*points.shape, 3)
 
     def outside(self, points: Tensor) -> Tensor:
-        """True for points (..., 3) beyond the valid domain of the grid, which move with the nearest group."""
+        """True for points (..., 3) beyond the valid domain of the grid; they move with the nearest group."""
         return ~self.grid.contains(points)
 
     @property
     def num_groups(self) -> int:
-        """Groups that the control points have been split into so far."""
+        """Number of groups of the control points."""
         return int(self.labels.max()) + 1
 
     @torch.no_grad()
     def remove_common_rigid(self, weights: Tensor | None = None) -> Tensor:
-        """Rigid transform C (4, 4), float64, in the implant's frame, that has been moved out of the control points.
+        """Remove the common rigid motion C from the control points and return it, (4, 4), float64, implant's frame.
 
-        C is the rigid motion that fits c -> c + phi_c best. The control points become phi'_c = C^-1 (c + phi_c) - c,
-        so that x + u(x) = C (x + u'(x)) exactly: B-splines reproduce rigid motions. (Beyond the grid this needs groups
-        whose CPs do not all lie on a line, for the rigid motion of such a group is ambiguous.)
+        C is the rigid motion that best fits c -> c + phi_c. The control points become phi'_c = C^-1 (c + phi_c) - c,
+        so that x + u(x) = C (x + u'(x)) exactly: B-splines reproduce rigid motions. (Beyond the grid this holds only
+        if no group has all its CPs on a line, because the rigid motion of such a group is ambiguous.)
 
         Args:
-            weights: shape (nx, ny, nz), how much each CP counts in the fit, such as the implant volume that it carries
-                (`control_point_volumes`); all alike if not given. The identity above holds for any.
+            weights: Weight of each CP in the fit, shape (nx, ny, nz), such as the implant volume that it carries
+                (`control_point_volumes`); equal if not given. The identity above holds for any weights.
         """
         positions = self.grid.positions().to(self.control_points.device).reshape(-1, 3)
         moved = positions + self.control_points.detach().double().reshape(-1, 3)
@@ -104,7 +104,7 @@ class SplineField(Deformation):
 
     @torch.no_grad()
     def reset(self) -> None:
-        """Takes all bending back."""
+        """Set the deformation to zero."""
         self.control_points.zero_()
         self.labels.zero_()
 

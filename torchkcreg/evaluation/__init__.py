@@ -1,4 +1,8 @@
-"""How good a registration is, and what it measured: errors at reference points and of the shape, displacement maps."""
+"""Evaluation of registrations.
+
+Errors at reference points and of the implant's shape, displacement maps, motion between fracture fragments, metal beads
+in views and volumes, and bone mineral in reconstructed volumes.
+"""
 
 from torchkcreg.geometry import distance_to
 

@@ -1,4 +1,4 @@
-"""Rigid alignment of one shape with another: coherent point drift, and a refinement that uses all of the surface."""
+"""Rigid alignment of shapes: coherent point drift, point-to-plane refinement, principal axes, frame changes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchkcreg.geometry import fit_rigid, principal_axes, rigid_matrix, transfo
 
 from .distances import closest_on_surface, finite_cloud
 
-_CPD_POINTS = 700  # its time and memory grow with their square
+_CPD_POINTS = 700  # time and memory grow with the square of it
 _CPD_ITERATIONS = 60
 _POINTS_PER_BLOCK = 60
 _SURFACE_POINTS = 4000
@@ -22,20 +22,20 @@ _SETTLED_MM = 1e-4
 def rigid_coherent_point_drift(
     moving: Tensor, fixed: Tensor, *, num_points: int = _CPD_POINTS, iterations: int = _CPD_ITERATIONS
 ) -> Tensor:
-    """The rigid motion (4, 4) that drifts one point cloud onto another (Myronenko & Song 2010), by the library pycpd.
+    """Rigid motion (4, 4) from one point cloud to another by coherent point drift (Myronenko & Song 2010).
 
-    Correspondences are soft, so that it comes home from far off; the scale is fixed at one, since neither the implant
-    nor its reference grows. What it costs grows with N M, so both clouds
-    are thinned, and that limits it to some tenths of a mm for an implant; `align_to_surface` goes on from there.
+    Uses the library pycpd, with the scale fixed at one. Correspondences are soft, so that it converges from far away.
+    Its cost grows with N M, so both clouds are thinned. This limits the accuracy to some tenths of a mm for an
+    implant; `align_to_surface` refines the result.
 
     Args:
-        moving: (N, 3) in mm.
-        fixed: (M, 3) in mm.
-        num_points: about how many points of each take part, merged on a lattice; a smaller cloud takes part whole.
-        iterations: at most.
+        moving: Point cloud (N, 3) to be moved, mm.
+        fixed: Point cloud (M, 3) to move it to, mm.
+        num_points: Approximate number of points used of each cloud, merged on a lattice. Smaller clouds are used whole.
+        iterations: Largest number of iterations.
 
     Raises:
-        ValueError: a cloud is empty, of another shape, or not finite.
+        ValueError: A cloud is empty, does not have shape (N, 3), or is not finite.
 
     >>> corner = torch.tensor([[0.0, 0, 0], [9, 0, 0], [0, 5, 0], [0, 0, 2]])
     >>> motion = rigid_coherent_point_drift(corner + torch.tensor([0.5, -1, 0]), corner)
@@ -43,7 +43,7 @@ def rigid_coherent_point_drift(
     [-0.5, 1.0, 0.0]
     """
     moving, fixed = finite_cloud(moving, "moving"), finite_cloud(fixed, "fixed")
-    center = fixed.mean(0)  # about the middle, where rotation and translation depend least on each other
+    center = fixed.mean(0)  # about the centroid, rotation and translation are least correlated
     drift = _Rigid(
         X=(merged(fixed, num_points) - center).numpy(),
         Y=(merged(moving, num_points) - center).numpy(),
@@ -57,7 +57,7 @@ def rigid_coherent_point_drift(
 
 
 class _Rigid(RigidRegistration):
-    """pycpd's rigid registration estimates a scale too; this one keeps it at one."""
+    """pycpd's rigid registration with the scale fixed at one; pycpd itself estimates it."""
 
     q: float
     sigma2: float
@@ -68,7 +68,7 @@ class _Rigid(RigidRegistration):
         self.t = (self.Pt1 @ self.X - self.P1 @ self.Y @ self.R)[None] / self.Np
 
     def update_variance(self) -> None:
-        """The variance for the scale one (fig. 2 of Myronenko & Song 2010 assumes the best scale)."""
+        """Update the variance for a scale of one (fig. 2 of Myronenko & Song 2010 assumes the optimal scale)."""
         before, fit = self.q, float(np.trace(self.A @ self.R))
         residual = float(self.Pt1 @ np.sum(self.X_hat**2, axis=1)) - 2 * fit + float(self.YPY)
         self.q = residual / (2 * self.sigma2) + self.D * self.Np / 2 * np.log(self.sigma2)
@@ -84,21 +84,21 @@ def align_to_surface(
     iterations: int = 30,
     num_points: int = _SURFACE_POINTS,
 ) -> Tensor:
-    """The rigid motion (4, 4) that lays points (N, 3) on a surface: least squares of their distances from it.
+    """Rigid motion (4, 4) that fits points (N, 3) to a surface, by least squares of their distances from it.
 
-    Each iteration takes the nearest points of the surface as planes (Chen & Medioni 1992), so that flat faces slide
-    freely along each other; nodes or points drawn to points would stick. It needs a start that is right within a few
-    mm, such as coherent point drift gives.
+    Point-to-plane ICP (Chen & Medioni 1992): flat faces slide freely along each other, where point-to-point distances
+    would hold them back. The start must be right within a few mm, as coherent point drift gives it.
 
     Args:
-        points: on or near the surface, mm.
-        mesh: the surface.
-        inset: the points lie inside by the same depth everywhere, which is estimated along: outermost nodes of voxels.
-        iterations: at most.
-        num_points: about how many of the points take part.
+        points: Points on or near the surface, mm.
+        mesh: The surface.
+        inset: True if the points lie inside the surface by the same unknown depth everywhere, as the outermost nodes of
+            a voxel grid do. The depth is estimated too.
+        iterations: Largest number of iterations.
+        num_points: Largest number of points used.
 
     Raises:
-        ValueError: the cloud is empty, of another shape or not finite, or the mesh has no faces.
+        ValueError: The cloud is empty, does not have shape (N, 3) or is not finite, or the mesh has no faces.
     """
     points = thinned(finite_cloud(points, "points"), num_points)
     center = points.mean(0)
@@ -120,7 +120,7 @@ def align_to_surface(
 
 
 def thinned(points: Tensor, num_points: int) -> Tensor:
-    """At most ``num_points`` of the points (N, 3): a random choice, the same each time."""
+    """At most `num_points` of the points (N, 3), a random choice that is the same each time."""
     if len(points) <= num_points:
         return points
     chosen = np.random.default_rng(0).permutation(len(points))[:num_points]
@@ -128,9 +128,9 @@ def thinned(points: Tensor, num_points: int) -> Tensor:
 
 
 def merged(points: Tensor, num_points: int) -> Tensor:
-    """Centroids of the points (N, 3) in blocks of a lattice, about ``num_points``; all points if fewer.
+    """Centroids of the points (N, 3) in blocks of a lattice, about `num_points`; all points if fewer.
 
-    For soft correspondences this is much better than a random choice: what represents a block stands in its middle.
+    For soft correspondences this is much better than a random choice, as each block is represented by its centroid.
     """
     if len(points) <= num_points:
         return points
@@ -149,7 +149,7 @@ def merged(points: Tensor, num_points: int) -> Tensor:
 
 
 def principal_motions(moving: Tensor, fixed: Tensor) -> list[Tensor]:
-    """The four rigid motions (4, 4) that lay centre and principal axes of one cloud (N, 3) onto those of another."""
+    """The four rigid motions (4, 4) that align centroid and principal axes of a cloud (N, 3) with those of another."""
     (center, axes), (target, target_axes) = _principal_frame(moving), _principal_frame(fixed)
     motions = []
     for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)):
@@ -161,7 +161,7 @@ def principal_motions(moving: Tensor, fixed: Tensor) -> list[Tensor]:
 
 
 def _principal_frame(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Centre (3,) and principal axes (3, 3) in columns, a proper rotation."""
+    """Centroid (3,) and principal axes (3, 3) in columns, a proper rotation."""
     center, rows = principal_axes(points)
     axes = rows.mT.clone()
     axes[:, 0] *= torch.linalg.det(axes).sign()
@@ -169,15 +169,15 @@ def _principal_frame(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def frame_changes(mesh: trimesh.Trimesh, other: trimesh.Trimesh, *, tolerance_mm: float = 0.1) -> list[Tensor]:
-    """Rigid motions (4, 4) from the frame of a mesh to that of the same body in another frame.
+    """Rigid motions (4, 4) from the frame of a mesh to that of another mesh of the same body.
 
-    One where the two have the same vertices in the same order; else all that lay the surfaces onto each other: of a
-    symmetric body several.
+    One motion if both have the same vertices in the same order. Otherwise all motions that align the surfaces; a
+    symmetric body has several.
 
     Args:
         mesh: A closed surface, mm.
-        other: The body in another frame, perhaps meshed otherwise.
-        tolerance_mm: Root mean square distance that surfaces of one body may have.
+        other: The same body in another frame; its vertices and faces may differ.
+        tolerance_mm: Largest root mean square distance between surfaces of the same body.
 
     Raises:
         ValueError: If the two are not the same body.
@@ -189,14 +189,14 @@ def frame_changes(mesh: trimesh.Trimesh, other: trimesh.Trimesh, *, tolerance_mm
             return [motion]
     samples = torch.from_numpy(np.array(trimesh.sample.sample_surface(mesh, _SURFACE_POINTS, seed=0)[0]))
     onto = torch.from_numpy(np.array(trimesh.sample.sample_surface(other, _SURFACE_POINTS, seed=0)[0]))
-    found, nearest = [], float("inf")
+    motions, nearest = [], float("inf")
     for start in principal_motions(samples, onto):
         motion = align_to_surface(transform_points(start, samples), other) @ start
         _, distance, _ = closest_on_surface(transform_points(motion, samples), other)
         off = float(distance.square().mean().sqrt())
         nearest = min(nearest, off)
         if off < tolerance_mm:
-            found.append(motion)
-    if not found:
+            motions.append(motion)
+    if not motions:
         raise ValueError(f"the two meshes are not of the same implant: their surfaces are {nearest:.2f} mm apart (RMS)")
-    return found
+    return motions

@@ -1,4 +1,4 @@
-"""Shadows of metal balls in X-ray views: where each is, to a small part of a pixel."""
+"""Shadows of metal balls in X-ray views: detection with subpixel accuracy, and tracking across the views of a scan."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, pad
 
-LEAST_SEEN = 0.8  # share of the views
-LEAST_CORRELATION = 0.6  # of a shadow with that of a ball
-AROUND = 1.6  # radius of what is compared, in the ball's
+LEAST_SEEN = 0.8  # share of the views a ball must be seen in
+LEAST_CORRELATION = 0.6  # of a shadow with the model of a ball's shadow
+AROUND = 1.6  # radius of the compared region, in radii of the ball
 
 
 def bead_shadows(
     line_integrals: Tensor, expected: Tensor, *, diameter_px: float, search_px: float = 10.0
 ) -> tuple[Tensor, Tensor]:
-    """Positions (V, N, 2) of balls' shadows near where they are expected, and their correlations (V, N).
+    """Positions (V, N, 2) of balls' shadows near expected positions, and their correlations (V, N).
 
-    A shadow is where the image, after a plane of grey values is taken from it, correlates best with the path through a
-    ball: between pixels along a parabola through the neighbours. NaN where no correlation reaches 0.6, or the best lies
-    at the rim of what was searched.
+    A plane of grey values is subtracted around each pixel, and the rest is correlated with the path length through a
+    ball. The position is the maximum of the correlation, interpolated between pixels by a parabola. NaN if no
+    correlation reaches 0.6, or if the maximum lies at the edge of the search region.
 
     Args:
-        line_integrals: (V, rows, cols).
-        expected: (u, v) of each ball in each view, pixels, (V, N, 2); NaN where it is not looked for.
-        diameter_px: of a shadow.
-        search_px: how far from the expected place.
+        line_integrals: Line integrals (V, rows, cols).
+        expected: Expected (u, v) of each ball in each view, pixels, (V, N, 2); NaN where a ball is not searched.
+        diameter_px: Diameter of a shadow.
+        search_px: Half width of the search region around the expected position.
 
     >>> rows, cols = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
     >>> image = (9 - (cols - 20.4) ** 2 - (rows - 17.6) ** 2).clamp_min(0).sqrt()
@@ -42,7 +42,7 @@ def bead_shadows(
         )
     if not diameter_px > 1 or not search_px > 0:
         raise ValueError(f"diameter_px must be above 1 and search_px positive, got {diameter_px} and {search_px}")
-    found = torch.full(expected.shape, math.nan, dtype=torch.float64)
+    positions = torch.full(expected.shape, math.nan, dtype=torch.float64)
     best = torch.zeros(expected.shape[:2], dtype=torch.float64)
     for view, image in enumerate(line_integrals.double().cpu()):
         if not bool(expected[view].isfinite().any()):
@@ -50,27 +50,28 @@ def bead_shadows(
         map_ = _correlation(image, diameter_px / 2)
         for bead, (u, v) in enumerate(expected[view].tolist()):
             if math.isfinite(u) and math.isfinite(v):
-                found[view, bead], best[view, bead] = _peak(map_, u, v, search_px)
-    return found, best
+                positions[view, bead], best[view, bead] = _peak(map_, u, v, search_px)
+    return positions, best
 
 
 def track_beads(
     line_integrals: Tensor, *, diameter_px: float, start: Tensor | None = None, search_px: float = 6.0
 ) -> Tensor:
-    """Tracks (V, N, 2) of balls' shadows across the views of a scan, each followed from the first view on.
+    """Tracks (V, N, 2) of balls' shadows across the views of a scan, starting in the first view.
 
-    Each is looked for where its last two positions lead. Views must follow each other closely: between two, a shadow
-    may turn aside by `search_px`.
+    Each shadow is searched at the linear extrapolation of its last two positions. Views must follow each other closely:
+    a shadow may deviate from the extrapolation by `search_px`.
 
     Args:
-        line_integrals: (V, rows, cols), in the order of the gantry's angles.
-        diameter_px: of a shadow.
-        start: (u, v) of the balls in the first view, (N, 2). If None, all that looks like one is followed, and what is
-            seen in four views of five counts: screws' tips and marks do not look like balls from all sides.
-        search_px: how far from the expected place.
+        line_integrals: Line integrals (V, rows, cols), in the order of the gantry's angles.
+        diameter_px: Diameter of a shadow.
+        start: Positions (u, v) of the balls in the first view, (N, 2). If None, all that looks like a ball there is
+            tracked, and tracks seen in at least four of five views are returned. Screw tips and marks do not look
+            like balls from all sides.
+        search_px: Half width of the search region around the expected position.
 
     Raises:
-        ValueError: nothing is a ball in four views of five, or one that was named is not.
+        ValueError: No ball is seen in at least four of five views, or a ball of `start` is lost more often.
     """
     first = _candidates(line_integrals[0], diameter_px) if start is None else torch.as_tensor(start).double()
     if first.dim() != 2 or first.shape[1] != 2:
@@ -78,18 +79,18 @@ def track_beads(
     last, step, tracks = first, torch.zeros_like(first), []
     for view in range(len(line_integrals)):
         expected = last + step
-        found, _ = bead_shadows(
+        positions, _ = bead_shadows(
             line_integrals[view : view + 1], expected[None], diameter_px=diameter_px, search_px=search_px
         )
-        seen = found[0].isfinite().all(-1, keepdim=True)
-        here = torch.where(seen, found[0], expected)
-        step = torch.where(seen, here - last, step) if view else torch.zeros_like(first)
-        last = here
-        tracks.append(found[0])
+        seen = positions[0].isfinite().all(-1, keepdim=True)
+        current = torch.where(seen, positions[0], expected)
+        step = torch.where(seen, current - last, step) if view else torch.zeros_like(first)
+        last = current
+        tracks.append(positions[0])
     result = torch.stack(tracks)
     steady = result.isfinite().all(-1).double().mean(0) >= LEAST_SEEN
     if start is not None and not bool(steady.all()):
-        lost = [index for index, kept in enumerate(steady.tolist()) if not kept]
+        lost = [index for index, is_steady in enumerate(steady.tolist()) if not is_steady]
         raise ValueError(f"beads {lost} of start are lost in more than one view of five: is diameter_px right?")
     if not bool(steady.any()):
         raise ValueError(f"nothing looks like a ball of {diameter_px:g} pixels in four views of five")
@@ -97,7 +98,7 @@ def track_beads(
 
 
 def _candidates(image: Tensor, diameter_px: float) -> Tensor:
-    """Places (N, 2) in an image where it looks like the shadow of a ball."""
+    """Positions (N, 2) in an image that look like the shadow of a ball."""
     map_ = _correlation(image.double().cpu(), diameter_px / 2)
     around = 2 * math.ceil(diameter_px / 2) + 1
     peaks = map_ == max_pool2d(map_[None, None], around, stride=1, padding=around // 2)[0, 0]
@@ -106,17 +107,17 @@ def _candidates(image: Tensor, diameter_px: float) -> Tensor:
 
 
 def _distinct(tracks: Tensor, diameter_px: float) -> Tensor:
-    """Each track once: two that end up on one ball are one."""
-    kept: list[int] = []
+    """The tracks without duplicates: tracks less than half a diameter apart follow the same ball."""
+    distinct: list[int] = []
     for bead in range(tracks.shape[1]):
-        apart = [(tracks[:, bead] - tracks[:, other]).norm(dim=-1).nanmedian() for other in kept]
-        if all(float(distance) > diameter_px / 2 for distance in apart):
-            kept.append(bead)
-    return tracks[:, kept]
+        distances = [(tracks[:, bead] - tracks[:, index]).norm(dim=-1).nanmedian() for index in distinct]
+        if all(float(distance) > diameter_px / 2 for distance in distances):
+            distinct.append(bead)
+    return tracks[:, distinct]
 
 
 def _correlation(image: Tensor, radius: float) -> Tensor:
-    """Correlation of an image's surroundings of each pixel with a ball's shadow, a plane taken away, (rows, cols)."""
+    """Correlation (rows, cols) of each pixel's surroundings, minus a fitted plane, with a ball's shadow."""
     kernels, inside = _kernels(radius)
     padded = pad(image[None, None], [kernels.shape[-1] // 2] * 4, mode="replicate")
     along, *planes = conv2d(padded, kernels)[0]
@@ -126,7 +127,7 @@ def _correlation(image: Tensor, radius: float) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _kernels(radius: float) -> tuple[Tensor, Tensor]:
-    """A ball's shadow and the three parts of a plane, (4, 1, n, n), orthonormal; where they count, (1, 1, n, n)."""
+    """Orthonormal kernels (4, 1, n, n) of a ball's shadow and a plane's three terms, and their support (1, 1, n, n)."""
     reach = math.ceil(AROUND * radius)
     steps = torch.arange(-reach, reach + 1, dtype=torch.float64)
     down, across = torch.meshgrid(steps, steps, indexing="ij")
@@ -148,7 +149,7 @@ def _kernels(radius: float) -> tuple[Tensor, Tensor]:
 
 
 def _peak(map_: Tensor, u: float, v: float, search: float) -> tuple[Tensor, float]:
-    """Position (u, v) and height of the greatest value near a place; NaN and 0 where there is none."""
+    """Position (u, v) and value of the maximum near a position; NaN and 0 if there is none."""
     nothing = torch.full((2,), math.nan, dtype=torch.float64), 0.0
     rows, cols = map_.shape
     top, left = max(1, math.ceil(v - search)), max(1, math.ceil(u - search))

@@ -1,4 +1,4 @@
-"""Metal balls in a reconstructed volume, to a small part of a voxel."""
+"""Metal balls in a reconstructed volume: detection, and centres with subvoxel accuracy."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from torch import Tensor
 
 from torchkcreg.geometry import VolumeGrid
 
-WINDOW_DIAMETERS = 0.6  # how far beyond a ball its surroundings are fitted with it
-LARGEST_EXTENT = 2.2  # of a candidate, in diameters and blurs: longer things are no balls
+WINDOW_DIAMETERS = 0.6  # margin around a ball that is fitted with it
+LARGEST_EXTENT = 2.2  # of a candidate, in diameters, with blur: longer objects are not balls
 LARGEST_BLUR = 0.5  # standard deviation, in diameters
 LEAST_CORRELATION = 0.8
-ISOLATION = 0.5  # share of its peak that a thing's surroundings must stay below
+ISOLATION = 0.5  # an object's surroundings must stay below this share of its peak
 
 
 @dataclass(frozen=True)
 class Beads:
-    """Balls found in a volume, the best first.
+    """Balls found in a volume, highest correlation first.
 
     Attributes:
-        centers: (N, 3) in world mm.
-        correlations: (N,) of the volume around each with the fitted ball.
-        contrasts: (N,) of each ball against its surroundings, in the volume's unit.
+        centers: Centres (N, 3), world mm.
+        correlations: Correlations (N,) of the volume around each ball with the fitted ball.
+        contrasts: Contrasts (N,) of the balls to their surroundings, in the volume's unit.
     """
 
     centers: Tensor
@@ -45,20 +45,22 @@ def find_beads(
     num_beads: int | None = None,
     threshold: float | None = None,
 ) -> Beads:
-    """Centres of metal balls in a volume (D, H, W), by fitting a blurred ball to each thing of the right size.
+    """Centres of metal balls in a volume (D, H, W), by fitting a blurred ball to each object of the right size.
 
-    Things are what exceeds a threshold and hangs together; plates and screws are too long, noise is no ball. The fit of
-    centre, contrast, surroundings and blur to the voxels around leaves an error of a few hundredths of a millimetre.
+    Objects are connected voxels above a threshold. Plates and screws are too long, and noise does not fit a ball.
+    Centre, contrast, background and blur are fitted to the voxels around each object; the error of the centre is a few
+    hundredths of a millimetre.
 
     Args:
-        volume: attenuation; FDK of the unloaded or the loaded scan.
-        grid: its voxels, at most half a ball apart.
-        diameter_mm: of the balls.
-        num_beads: how many to return, the best; all that look like balls if None.
-        threshold: of what may be metal; if None, several between soft tissue and the brightest voxels are tried.
+        volume: Attenuation, such as the FDK of the unloaded or the loaded scan.
+        grid: The volume's voxels, at most half a ball's diameter apart.
+        diameter_mm: Diameter of the balls.
+        num_beads: Number of balls to return, best first; all that look like balls if None.
+        threshold: Smallest attenuation of metal; if None, several fractions of the brightest voxels' mean are tried.
 
     Raises:
-        ValueError: the shapes differ, the voxels are larger than the balls' radius, or fewer balls than asked for.
+        ValueError: The shapes differ, the voxels are larger than the balls' radius, or fewer than `num_beads` balls
+            are found.
 
     >>> grid = VolumeGrid.centered((24, 24, 24), 0.5)
     >>> offset = (grid.points() - torch.tensor([0.3, -0.2, 0.1])).norm(dim=-1)
@@ -71,25 +73,25 @@ def find_beads(
     if not diameter_mm > 0 or max(grid.spacing) > diameter_mm / 2:
         raise ValueError(f"voxels must be at most half a ball of {diameter_mm} mm apart, got {grid.spacing}")
     values = volume.detach().cpu().double().numpy()
-    found: list[tuple[float, float, NDArray]] = []
+    fits: list[tuple[float, float, NDArray]] = []
     for level in [threshold] if threshold is not None else _levels(values, grid, diameter_mm):
         for candidate in _candidates(values, grid, level, diameter_mm):
-            if all(np.linalg.norm(candidate - center) > diameter_mm / 2 for _, _, center in found):
+            if all(np.linalg.norm(candidate - center) > diameter_mm / 2 for _, _, center in fits):
                 fit = fit_bead(values, grid, candidate, diameter_mm)
-                if fit is not None and all(np.linalg.norm(fit[2] - c) > diameter_mm / 2 for _, _, c in found):
-                    found.append(fit)
-    found.sort(key=lambda fit: -fit[0])
+                if fit is not None and all(np.linalg.norm(fit[2] - c) > diameter_mm / 2 for _, _, c in fits):
+                    fits.append(fit)
+    fits.sort(key=lambda fit: -fit[0])
     if num_beads is not None:
-        if len(found) < num_beads:
-            raise ValueError(f"only {len(found)} of {num_beads} beads were found")
-        found = found[:num_beads]
-    columns = list(zip(*found)) or [(), (), ()]
+        if len(fits) < num_beads:
+            raise ValueError(f"only {len(fits)} of {num_beads} beads were found")
+        fits = fits[:num_beads]
+    columns = list(zip(*fits)) or [(), (), ()]
     centers = torch.from_numpy(np.array(columns[2], dtype=np.float64).reshape(-1, 3))
     return Beads(centers, torch.tensor(columns[0]).double(), torch.tensor(columns[1]).double())
 
 
 def _levels(values: NDArray, grid: VolumeGrid, diameter_mm: float) -> list[float]:
-    """Thresholds to try, falling: shares of the brightest part as large as a few balls."""
+    """Falling thresholds to try: shares of the mean of the brightest voxels, as many as fill four balls."""
     ball = max(1, round(math.pi / 6 * diameter_mm**3 / grid.voxel_volume))
     count = min(values.size, 4 * ball)
     bright = float(np.partition(values.ravel(), -count)[-count:].mean())
@@ -97,7 +99,7 @@ def _levels(values: NDArray, grid: VolumeGrid, diameter_mm: float) -> list[float
 
 
 def _candidates(values: NDArray, grid: VolumeGrid, level: float, diameter_mm: float) -> list[NDArray]:
-    """World positions of things above a level that are about as large as a ball in each direction."""
+    """World positions of objects above a level that are about as large as a ball in each direction."""
     labels, _ = label(values > level)
     largest = [LARGEST_EXTENT * diameter_mm / step + 1 for step in reversed(grid.spacing)]
     to_world = grid.voxel_to_world.numpy()
@@ -120,7 +122,7 @@ def _candidates(values: NDArray, grid: VolumeGrid, level: float, diameter_mm: fl
 
 
 def _is_alone(values: NDArray, box: tuple[slice, ...], diameter: list[float]) -> bool:
-    """Whether what surrounds a thing, half a diameter to one away, is mostly much darker than its peak."""
+    """True if the surroundings of an object, 0.5 to 1 diameter away, are mostly much darker than its peak."""
     wide = tuple(
         slice(max(0, part.start - math.ceil(d)), min(n, part.stop + math.ceil(d)))
         for part, n, d in zip(box, values.shape, diameter)
@@ -139,9 +141,9 @@ def _is_alone(values: NDArray, box: tuple[slice, ...], diameter: list[float]) ->
 def fit_bead(
     values: NDArray, grid: VolumeGrid, start: NDArray, diameter_mm: float
 ) -> tuple[float, float, NDArray] | None:
-    """Correlation, contrast and centre of the blurred ball that fits best near a place; None where none does.
+    """Correlation, contrast and centre of the blurred ball that fits best near a position; None if none fits.
 
-    A plane of grey values lies under the ball, for the shading that metal nearby leaves.
+    The background is a linear function of position, to account for shading by metal nearby.
     """
     to_voxel = grid.world_to_voxel.numpy()
     middle = to_voxel[:3, :3] @ start + to_voxel[:3, 3]
@@ -178,14 +180,14 @@ def fit_bead(
     shape = columns[:, 0] - columns[:, 0].mean()
     flat = observed - columns[:, 1:] @ coefficients[1:]
     correlation = float(np.corrcoef(shape, flat)[0, 1]) if np.ptp(shape) > 0 else 0.0
-    at_bound = best.x[3] > bounds[1][3] - 1e-3  # a bump wider than a blurred ball
+    at_bound = best.x[3] > bounds[1][3] - 1e-3  # wider than a blurred ball
     if at_bound or coefficients[0] <= 0 or not correlation > LEAST_CORRELATION:
         return None
     return correlation, float(coefficients[0]), best.x[:3]
 
 
 def blurred_ball(distance: NDArray, radius: float, sigma: float) -> NDArray:
-    """A ball of height 1 after a Gaussian blur, at distances from its centre; all lengths in mm."""
+    """Values of a ball of height 1 after a Gaussian blur, at distances from its centre; all lengths in mm."""
     d = np.maximum(distance, 1e-6 * radius)
     inside, outside = (radius - d) / sigma, (radius + d) / sigma
     steps = 0.5 * (erf(inside / math.sqrt(2)) + erf(outside / math.sqrt(2)))

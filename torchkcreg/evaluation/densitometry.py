@@ -1,4 +1,4 @@
-"""Bone mineral in regions of a reconstruction."""
+"""Bone mineral in regions of a reconstructed volume."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ CALCIUM_IN_HYDROXYAPATITE = 0.3989  # by mass, of Ca10(PO4)6(OH)2
 
 @dataclass(frozen=True)
 class MineralContent:
-    """What a region holds.
+    """Bone mineral of a region.
 
     Attributes:
-        name: Of the region.
-        num_voxels: How many voxels count: those of the region that are far enough from metal.
-        left_out: Share of the region's voxels that are not.
-        volume_ml: Theirs.
+        name: Name of the region.
+        num_voxels: Number of voxels measured: the usable ones, such as those far enough from metal.
+        left_out: Share of the region's voxels that are excluded.
+        volume_ml: Volume of the measured voxels.
         calcium_mg_ml: Mean concentration of calcium.
-        std_mg_ml: Standard deviation of the voxels about it.
+        std_mg_ml: Standard deviation of the concentration over the voxels.
     """
 
     name: str
@@ -35,30 +35,30 @@ class MineralContent:
 
     @property
     def hydroxyapatite_mg_ml(self) -> float:
-        """The same calcium as hydroxyapatite, which phantoms and scanners of bone are calibrated in."""
+        """Mean concentration as hydroxyapatite, the unit in which bone phantoms and scanners are calibrated."""
         return self.calcium_mg_ml / CALCIUM_IN_HYDROXYAPATITE
 
     @property
     def content_mg(self) -> float:
-        """Hydroxyapatite in all of the counted volume."""
+        """Mass of hydroxyapatite in the measured volume."""
         return self.hydroxyapatite_mg_ml * self.volume_ml
 
 
 def mineral_content(
     calcium_mg_ml: Tensor, regions: Mapping[str, Tensor], grid: VolumeGrid, *, usable: Tensor | None = None
 ) -> list[MineralContent]:
-    """What regions hold of calcium.
+    """Bone mineral of each region.
 
     Args:
-        calcium_mg_ml: (D, H, W).
-        regions: Name and voxels (D, H, W), true inside, of each.
-        grid: The voxels.
-        usable: True where voxels may count, such as beyond some distance from metal; all if None.
+        calcium_mg_ml: Concentration of calcium (D, H, W).
+        regions: Masks (D, H, W) by name, true inside the region.
+        grid: Voxels of the volume.
+        usable: True for voxels to measure, such as those far enough from metal; all if None.
 
     Raises:
         ValueError: If shapes differ, or a region has fewer than two usable voxels.
     """
-    found = []
+    contents = []
     for name, region in regions.items():
         if region.shape != calcium_mg_ml.shape or tuple(region.shape) != tuple(grid.shape):
             raise ValueError(
@@ -71,7 +71,7 @@ def mineral_content(
             raise ValueError(f"region {name} has {len(values)} usable voxels of {int(whole.sum())}, too few to measure")
         if not bool(torch.isfinite(values).all()):
             raise ValueError(f"region {name} holds values that are not finite")
-        found.append(
+        contents.append(
             MineralContent(
                 name,
                 len(values),
@@ -81,4 +81,4 @@ def mineral_content(
                 float(values.std()),
             )
         )
-    return found
+    return contents

@@ -1,4 +1,4 @@
-"""Displacement maps: how an implant bent, seen from its distal end (fig. 3B of the paper)."""
+"""Displacement maps: bending of an implant relative to its distal end (fig. 3B of the paper)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class DisplacementMap:
     """Displacements of an implant's nodes relative to its distal end.
 
     Attributes:
-        undeformed: the undeformed nodes laid onto the deformed ones at the distal end, (N, 3) in the world, mm.
-        vectors: from there to the deformed nodes, (N, 3), mm.
-        magnitudes: their lengths (N,), mm.
-        distal: the nodes that were aligned, bool (N,).
-        alignment: the rigid motion (4, 4) that laid them there.
+        undeformed: Undeformed nodes (N, 3), aligned with the deformed ones at the distal end, world mm.
+        vectors: Displacements (N, 3) from the undeformed to the deformed nodes, mm.
+        magnitudes: Lengths (N,) of the displacements, mm.
+        distal: True for the nodes used for the alignment, bool (N,).
+        alignment: Rigid motion (4, 4) of the undeformed nodes into the world.
     """
 
     undeformed: Tensor
@@ -42,22 +42,22 @@ def displacement_map(
     weights: Tensor | None = None,
     distal_direction: tuple[float, float, float] = (0.0, 0.0, -1.0),
 ) -> DisplacementMap:
-    """How far each node of an implant moved when the undeformed and the deformed one agree at the distal end.
+    """Displacement of each node of an implant, with undeformed and deformed implant aligned at the distal end.
 
     "The bottom portions of undeformed and deformed point clouds were first rigidly registered, and the Euclidean
-    distance between the two clouds at every node was then calculated" (section 2.4 of Cao et al. 2020). The motion of
-    the implant as a whole drops out; an implant that only moved has a map of zeros.
+    distance between the two clouds at every node was then calculated" (section 2.4 of Cao et al. 2020). Rigid
+    motion of the implant is removed: an implant that only moved has a map of zeros.
 
     Args:
-        points: nodes (N, 3) of the undeformed implant, in any frame, mm.
-        warped: the same nodes deformed, (N, 3) in the world, mm.
-        distal_fraction: share of the implant's length, from the distal end, that is aligned; in (0, 1].
-        weights: (N,), the nodes' volumes; equal where not given.
-        distal_direction: the world's direction to the distal end; by default down, away from the body. Of the two
-            ends of the implant's long axis the one farther that way is the distal one.
+        points: Nodes (N, 3) of the undeformed implant, in any frame, mm.
+        warped: The same nodes deformed, (N, 3) in the world, mm.
+        distal_fraction: Share of the implant's length, from the distal end, that is aligned; in (0, 1].
+        weights: Weights (N,) such as the nodes' volumes; equal if None.
+        distal_direction: Direction to the distal end in the world; by default down, away from the body. The end of
+            the implant's long axis that lies farther in this direction is the distal one.
 
     Raises:
-        ValueError: shapes differ, the fraction is outside (0, 1], or fewer than three nodes lie in it.
+        ValueError: Shapes differ, the fraction is outside (0, 1], or fewer than three nodes lie in the distal part.
 
     >>> straight = torch.tensor([[x, 0.0, z] for z in range(9) for x in range(2)])
     >>> bent = straight + torch.tensor([[0.0, max(0.0, z - 4.0), 0.0] for z in range(9) for x in range(2)])

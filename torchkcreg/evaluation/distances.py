@@ -1,4 +1,4 @@
-"""Distances of an estimated implant from a reference: to its nearest node, and to its surface."""
+"""Distances of points from nodes and surfaces, and properties of point clouds (spacing, volume or surface)."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-# Distance of a point of the unit cube from the cube's centre: mean (half the Robbins-like box integral B_3(1)),
+# Distance of a point of the unit cube from the cube's centre: mean (half the box integral B_3(1)),
 # and root mean square (three times the variance 1/12 of a uniform number).
 _MEAN_IN_CELL = 0.4802959782
 _RMS_IN_CELL = 0.5
-_BETWEEN_SURFACE_AND_BODY = 2.2  # lattices have 1.7 and 2.7 over so short a range
+_BETWEEN_SURFACE_AND_BODY = 2.2  # dimension; surface and volume lattices give 1.7 and 2.7 over this short range
 
 
 def nearest_node_distances(points: Tensor, nodes: Tensor) -> Tensor:
     """Distances (N,) in mm from each point (N, 3) to the nearest of the nodes (M, 3), float64.
 
-    Between lattices it is no measure of a fine registration: see `nearest_node_floor`.
+    Between lattices it does not resolve small registration errors: see `nearest_node_floor`.
 
     Raises:
-        ValueError: a cloud is empty, of another shape, or not finite.
+        ValueError: A cloud is empty, does not have shape (N, 3), or is not finite.
 
     >>> nearest_node_distances(torch.tensor([[0.0, 0.0, 0.2]]), torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     tensor([0.2000], dtype=torch.float64)
@@ -34,14 +34,14 @@ def nearest_node_distances(points: Tensor, nodes: Tensor) -> Tensor:
 
 
 def nearest_node_floor(pitch_mm: float) -> tuple[float, float]:
-    """Mean and RMS distance in mm between the nodes of two perfect clouds of one body, the second of this pitch.
+    """Smallest mean and RMS distance in mm from the nodes of a perfect cloud to those of another with this pitch.
 
-    Lattices that do not coincide cannot do better: a node lies anywhere in a cell of the other lattice, so that its
-    distance from the node in the cell's middle is 0.480 pitches on average, 0.5 RMS and up to 0.866. At the paper's
-    0.25 mm that is 0.120 and 0.125 mm. (Lattices that happen to be parallel have anything from 0 to 0.866 pitches.)
+    A node lies anywhere in a cell of the other lattice. Its distance from the node in the middle of the cell is 0.480
+    pitches on average, 0.5 RMS and at most 0.866. At the paper's 0.25 mm that is 0.120 and 0.125 mm. (Lattices that
+    happen to be parallel have anything from 0 to 0.866 pitches.)
 
     Raises:
-        ValueError: the pitch is not positive.
+        ValueError: The pitch is not positive.
 
     >>> nearest_node_floor(0.25)
     (0.12007399455, 0.125)
@@ -52,12 +52,12 @@ def nearest_node_floor(pitch_mm: float) -> tuple[float, float]:
 
 
 def node_spacing(nodes: Tensor, *, num_samples: int = 2000) -> float:
-    """The pitch in mm of nodes (N, 3) on a lattice: nine tenths of them are no farther from their nearest neighbour.
+    """Pitch in mm of nodes (N, 3) on a lattice: the 0.9 quantile of the distances to the nearest neighbour.
 
-    Not the median: at the surface, nodes may stand off the lattice, at the centroid of the metal in their cell.
+    Not the median, because nodes at the surface may lie off the lattice, at the centroid of the metal in their cell.
 
     Raises:
-        ValueError: there are fewer than two different nodes.
+        ValueError: There are fewer than two different nodes.
     """
     array = finite_cloud(nodes, "nodes").numpy()
     sample = array[np.linspace(0, len(array) - 1, min(len(array), num_samples)).round().astype(int)]
@@ -71,7 +71,7 @@ def surface_distances(points: Tensor, mesh: trimesh.Trimesh) -> Tensor:
     """Distances (N,) in mm from each point (N, 3) to the nearest point of a surface, float64, never negative.
 
     Raises:
-        ValueError: the cloud is empty, of another shape or not finite, or the mesh has no faces.
+        ValueError: The cloud is empty, does not have shape (N, 3) or is not finite, or the mesh has no faces.
 
     >>> box = trimesh.creation.box((2.0, 2.0, 2.0))
     >>> surface_distances(torch.tensor([[0.0, 0.0, 1.25], [0.0, 0.0, 0.5], [4.0, 5.0, 0.0]]), box).tolist()
@@ -91,10 +91,10 @@ def closest_on_surface(points: Tensor, mesh: trimesh.Trimesh) -> tuple[Tensor, T
 
 
 def fills_volume(points: Tensor, *, num_samples: int = 1000) -> bool:
-    """Whether points (N, 3) fill a body, like the nodes of a volume, or only cover its surface, like an optical scan.
+    """True if points (N, 3) fill a volume like nodes, False if they cover a surface like an optical scan.
 
-    Told from the correlation dimension (Grassberger & Procaccia 1983) between 1.5 and 3 times their spacing: about 2 on
-    a surface and 3 in a body. A scan whose noise exceeds its spacing looks like a body.
+    Decided by the correlation dimension (Grassberger & Procaccia 1983) between 1.5 and 3 times the spacing: about 2
+    for a surface and 3 for a volume. A scan whose noise exceeds its spacing looks like a volume.
 
     >>> line = torch.arange(9.0)
     >>> fills_volume(torch.cartesian_prod(line, line, line)), fills_volume(torch.cartesian_prod(line, line, line[:1]))
@@ -110,23 +110,23 @@ def fills_volume(points: Tensor, *, num_samples: int = 1000) -> bool:
 
 
 def outermost_nodes(nodes: Tensor, *, num_samples: int = 50_000) -> Tensor:
-    """Those nodes (n, 3) of a body's cloud (N, 3) that have neighbours on one side only, out of some of its nodes.
+    """Nodes (n, 3) at the surface of a body's cloud (N, 3), out of a sample of its nodes.
 
-    The 26 nearest neighbours of an inner lattice node surround it; where they leave a side open, their centroid lies
-    off the node by a good part of the spacing.
+    The 26 nearest neighbours of an inner lattice node surround it. At the surface their centroid is more than a quarter
+    of the spacing away from the node.
     """
     array = finite_cloud(nodes, "nodes").numpy()
-    some = array[np.linspace(0, len(array) - 1, min(len(array), num_samples)).round().astype(int)]
-    _, neighbours = cKDTree(array).query(some, k=min(27, len(array)))
-    off = np.linalg.norm(array[neighbours].mean(axis=1) - some, axis=1)
-    return torch.from_numpy(some[off > 0.25 * node_spacing(nodes)])
+    sample = array[np.linspace(0, len(array) - 1, min(len(array), num_samples)).round().astype(int)]
+    _, neighbours = cKDTree(array).query(sample, k=min(27, len(array)))
+    offset = np.linalg.norm(array[neighbours].mean(axis=1) - sample, axis=1)
+    return torch.from_numpy(sample[offset > 0.25 * node_spacing(nodes)])
 
 
 def finite_cloud(points: Tensor, name: str) -> Tensor:
     """The points (N, 3) on the CPU in float64.
 
     Raises:
-        ValueError: the shape is another, there is no point, or a point is not finite.
+        ValueError: The shape is not (N, 3), there is no point, or a point is not finite.
     """
     if points.ndim != 2 or points.shape[-1] != 3 or len(points) == 0:
         raise ValueError(f"{name} must have shape (N, 3) with N > 0, got {tuple(points.shape)}")

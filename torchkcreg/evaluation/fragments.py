@@ -1,4 +1,4 @@
-"""Which parts of an implant move with one fragment of a bone, which with the other."""
+"""Assignment of an implant's nodes and screws to the two fragments of a fractured bone."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ _FEWEST_NODES = 12
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """Two fragments, each told by the nodes of the implant that are fixed to it.
+    """Two bone fragments, each represented by the nodes of the implant that are fixed to it.
 
     Attributes:
-        lower: Nodes (N, 3) in the implant's frame, mm.
-        upper: Those of the other one.
-        gap: The point (3,) of the implant's frame where their motion is told: between them, in the implant's middle.
-        names: Of the screws in each; empty where no screws told them.
+        lower: Nodes (N, 3) of the lower fragment in the implant's frame, mm.
+        upper: Nodes (M, 3) of the upper fragment.
+        gap: Point (3,) in the implant's frame where the translation is measured: between the fragments, at the centre
+            of the implant's cross-section.
+        names: Names of the screws in each; empty without screws.
     """
 
     lower: Tensor
@@ -34,7 +35,7 @@ class Fragments:
     names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     def swapped(self) -> Fragments:
-        """The other one first."""
+        """The same with lower and upper fragment exchanged."""
         return Fragments(self.upper, self.lower, self.gap, self.names[::-1])
 
 
@@ -48,16 +49,17 @@ def fragments_of(
 ) -> Fragments:
     """Fragments of the bone under an implant.
 
-    Screws belong to the lower or the upper one: by the widest gap between their heads along the implant, by a plane, or
-    by the surface of one fragment that holds most of their shafts. The implant's nodes near their heads tell how it
-    moves. Without screws the thirds of the implant at its ends do, or all on either side of a plane.
+    Screws are assigned to the lower or the upper fragment: by the widest gap between their heads along the implant, by
+    a plane, or by the surface of one fragment that holds most of their shafts. Each fragment is represented by the
+    implant's nodes near the heads of its screws. Without screws the two end thirds of the implant are used, or all
+    nodes on either side of a plane.
 
     Args:
-        nodes: Of the undeformed implant, (N, 3), in its frame, mm.
-        screws: Of it.
-        radius_mm: How near to a screw's head nodes move with it.
-        plane: A point (3,) of it and its normal (3,); along the implant when None.
-        mesh: One fragment's surface in the implant's frame; it is the upper one then.
+        nodes: Nodes (N, 3) of the undeformed implant in its frame, mm.
+        screws: Screws of the implant.
+        radius_mm: Nodes within this distance of a screw's head are used.
+        plane: A point (3,) of the fracture plane and its normal (3,); a normal of None is the implant's long axis.
+        mesh: Surface of one fragment in the implant's frame; it becomes the upper one.
 
     Raises:
         ValueError: If all screws, or hardly any nodes, belong to one fragment.
@@ -72,7 +74,7 @@ def fragments_of(
     height = (nodes - middle) @ axis
     if mesh is not None:
         if not screws:
-            raise ValueError("a fragment's mesh tells fragments by their screws, and there are none")
+            raise ValueError("a fragment's mesh assigns screws to fragments, but the implant has no screws")
         inside = torch.tensor([_share_inside(mesh, screw) > 0.5 for screw in screws])
     elif plane is not None:
         inside = (heads - middle) @ axis > 0
@@ -82,12 +84,14 @@ def fragments_of(
         reach = height.abs().max() / 3 if plane is None else 0.0
         return _fragments([nodes[height < -reach], nodes[height > reach]], middle, ((), ()))
     if bool(inside.all()) or not bool(inside.any()):
-        raise ValueError(f"all {len(screws)} screws belong to one fragment: say where the fracture is by a plane")
+        raise ValueError(f"all {len(screws)} screws belong to one fragment: give the plane of the fracture")
     near = torch.cdist(heads, nodes) <= torch.cdist(heads, nodes).amin(1, keepdim=True).clamp_min(radius_mm)
     sides = [~inside, inside]
     gap = torch.stack([_innermost(heads[side], heads[~side]) for side in sides]).mean(0)
     gap = _in_the_middle(nodes, gap)
-    below, above = (tuple(s.name for s, here in zip(screws, side.tolist(), strict=True) if here) for side in sides)
+    below, above = (
+        tuple(s.name for s, is_member in zip(screws, side.tolist(), strict=True) if is_member) for side in sides
+    )
     return _fragments([nodes[near[side].any(0)] for side in sides], gap, (below, above))
 
 
@@ -112,13 +116,13 @@ def _share_inside(mesh: trimesh.Trimesh, screw: Screw) -> float:
     return float(mesh.contains(places).mean())
 
 
-def _innermost(own: Tensor, others: Tensor) -> Tensor:
-    """The head that is next to those of the other fragment."""
-    return own[torch.cdist(own, others).amin(1).argmin()]
+def _innermost(heads: Tensor, other_heads: Tensor) -> Tensor:
+    """The head that is nearest to those of the other fragment."""
+    return heads[torch.cdist(heads, other_heads).amin(1).argmin()]
 
 
 def _in_the_middle(nodes: Tensor, point: Tensor) -> Tensor:
-    """The centre of the implant's cross-section at a point."""
+    """Centre of the implant's cross-section at the height of a point."""
     _, (*_, axis) = principal_axes(nodes)
     height = ((nodes - point) @ axis).abs()
     center = nodes[height <= height.sort().values[len(nodes) // 50 + 1] + 1e-9].mean(0)

@@ -1,4 +1,4 @@
-"""Errors of points: where the registration puts them against where they are."""
+"""Errors of a registration at reference points: distances between estimated and true positions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def point_errors(estimated: Tensor, truth: Tensor) -> Tensor:
     """Distances (..., N) in mm between estimated and true points (..., N, 3).
 
     Raises:
-        ValueError: the shapes differ.
+        ValueError: The shapes differ.
 
     >>> point_errors(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]])).tolist()
     [5.0]
@@ -30,7 +30,7 @@ def bb_rmse(estimated: Tensor, truth: Tensor) -> Tensor:
     The paper's measure of a registration, with the reference BBs as points (section 2.4, table 1 of Cao et al. 2020).
 
     Raises:
-        ValueError: the shapes differ, or there is no point.
+        ValueError: The shapes differ, or there is no point.
 
     >>> bb_rmse(torch.zeros(2, 3), torch.tensor([[1.0, 0.0, 0.0], [0.0, 7.0, 0.0]])).item()
     5.0
@@ -46,15 +46,15 @@ class PointMetrics:
     """Errors of a registration at reference points, all lengths in mm.
 
     Attributes:
-        num_points: how many reference points.
-        rmse_mm: root mean square distance.
-        mean_mm: mean distance.
-        median_mm: median distance.
-        max_mm: largest distance.
-        rmse_xyz_mm: root mean square error along world x, y and z; their squares add up to that of `rmse_mm`.
-        motion_rms_mm: root mean square distance that the points moved in truth, where their start is known.
-        num_outside: points beyond the control-point grid's valid domain, where the field is only continued.
-        gc: final gradient correlation of each view.
+        num_points: Number of reference points.
+        rmse_mm: Root mean square distance.
+        mean_mm: Mean distance.
+        median_mm: Median distance.
+        max_mm: Largest distance.
+        rmse_xyz_mm: Root mean square error along world x, y and z; their squares add up to that of `rmse_mm`.
+        motion_rms_mm: Root mean square of the points' true motion, if their start is known.
+        num_outside: Number of points outside the control-point grid's valid domain, where the field is extrapolated.
+        gc: Final gradient correlation of each view.
     """
 
     num_points: int
@@ -68,7 +68,7 @@ class PointMetrics:
     gc: tuple[float, ...] | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """The metrics as plain data; what is not known is left out."""
+        """The metrics as plain data, without unknown ones."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
     def __str__(self) -> str:
@@ -85,12 +85,12 @@ def evaluate_points(estimated: Tensor, truth: Tensor, *, start: Tensor | None = 
     """Errors of estimated positions of reference points such as BBs.
 
     Args:
-        estimated: where the registration puts them (N, 3), mm.
-        truth: where they are (N, 3).
-        start: where they were before (N, 3), to tell how far they moved.
+        estimated: Positions (N, 3) estimated by the registration, mm.
+        truth: True positions (N, 3), mm.
+        start: Positions (N, 3) before the motion, to measure how far they moved, mm.
 
     Raises:
-        ValueError: shapes differ, or there is no point.
+        ValueError: Shapes differ, or there is no point.
 
     >>> print(evaluate_points(torch.zeros(2, 3), torch.tensor([[0.3, 0.0, 0.0], [0.0, 0.0, 0.1]])))
     2 points: RMSE 0.224 mm (x 0.212, y 0.000, z 0.071), mean 0.200, median 0.200, largest 0.300 mm
@@ -113,7 +113,7 @@ def evaluate_points(estimated: Tensor, truth: Tensor, *, start: Tensor | None = 
 
 
 class Registered(Protocol):
-    """What can be evaluated: a `torchkcreg.registration.RegistrationResult`, or anything else that warps points."""
+    """Interface of registrations to evaluate, such as `torchkcreg.registration.RegistrationResult`."""
 
     gc: Tensor
 
@@ -121,20 +121,20 @@ class Registered(Protocol):
         """World positions of points of the implant's frame."""
 
     def outside(self, points: Tensor) -> Tensor:
-        """True for points where the deformation is only continued."""
+        """True for points where the deformation is extrapolated."""
 
 
 def evaluate(result: Registered, points: Tensor, truth: Tensor, *, start: Tensor | None = None) -> PointMetrics:
-    """Errors of a registration at reference points such as BBs, with what it says of itself.
+    """Errors of a registration at reference points such as BBs, with its gradient correlations.
 
     Args:
-        result: the registration.
-        points: reference points (N, 3) in the implant's frame, on or near the undeformed implant, mm.
-        truth: where they are in the world at the time of the projections (N, 3).
-        start: where they were before (N, 3), to tell how far they moved.
+        result: The registration.
+        points: Reference points (N, 3) in the implant's frame, on or near the undeformed implant, mm.
+        truth: True positions (N, 3) in the world at the time of the projections, mm.
+        start: Positions (N, 3) before the motion, to measure how far they moved, mm.
 
     Raises:
-        ValueError: shapes differ, or there is no point.
+        ValueError: Shapes differ, or there is no point.
     """
     points = points.double()
     metrics = evaluate_points(result.warp(points), truth, start=start)

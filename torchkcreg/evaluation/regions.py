@@ -1,4 +1,4 @@
-"""Regions of interest in reconstructed volumes, and what the volume holds there."""
+"""Regions of interest in reconstructed volumes, and statistics of the values inside."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torchkcreg.geometry import VolumeGrid
 
 @dataclass(frozen=True)
 class RegionStatistics:
-    """A volume's values in a region.
+    """Statistics of a volume's values in a region.
 
     Attributes:
-        num_voxels: how many voxels it has.
-        mean: their mean.
-        std: their standard deviation.
-        mean_error: mean minus that of a reference volume in the same voxels, where there is one.
-        std_error: standard deviation of the difference from it.
+        num_voxels: Number of voxels.
+        mean: Mean value.
+        std: Standard deviation of the values.
+        mean_error: Mean difference from a reference volume in the same voxels, if one is given.
+        std_error: Standard deviation of that difference.
     """
 
     num_voxels: int
@@ -47,10 +47,10 @@ def cylinder_region(grid: VolumeGrid, start: Sequence[float], end: Sequence[floa
 
 
 def region_statistics(volume: Tensor, region: Tensor, *, reference: Tensor | None = None) -> RegionStatistics:
-    """Mean and standard deviation of a volume (D, H, W) in a region, and how far it is from a reference.
+    """Mean and standard deviation of a volume (D, H, W) in a region, and of its difference from a reference.
 
     Raises:
-        ValueError: shapes differ, or the region holds fewer than two voxels.
+        ValueError: Shapes differ, or the region holds fewer than two voxels.
 
     >>> region_statistics(torch.tensor([1.0, 3.0, 9.0]), torch.tensor([True, True, False])).mean
     2.0

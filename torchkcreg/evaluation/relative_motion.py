@@ -1,4 +1,4 @@
-"""How an implant, and the fragments it holds, moved between two registrations, and how sure that is."""
+"""Motion of bone fragments and deflection of the implant between two registrations, with standard deviations."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ AXES = ("across", "out of plane", "along")
 
 @dataclass(frozen=True, eq=False)
 class RelativeMotion:
-    """The motion of the upper fragment against the lower one, from a first registration to a second.
+    """Motion of the upper fragment relative to the lower one, from a first registration to a second.
 
-    Vectors are in the implant's axes where the first registration has it: across (its width), out of plane (away from
-    the bone, where screws tell), along (from the lower to the upper fragment).
+    Vectors are in the implant's axes at its pose in the first registration: across (its width), out of plane (away from
+    the bone if there are screws), along (from the lower to the upper fragment).
 
     Attributes:
-        axes: Those axes in the world, (3, 3), one a row.
-        motion: The rigid motion (4, 4) in the world, as if the lower fragment had not moved.
-        rotation_deg: Its rotation vector (3,), degrees.
-        rotation_std_deg: Standard deviations.
-        translation_mm: Of the gap, (3,), mm.
-        translation_std_mm: Standard deviations.
-        gap: Where that is, (3,), in the implant's frame.
-        heights: Of S stations, mm from the implant's lower end.
-        deflection_mm: How far the implant moved there against the lower fragment, (S, 3).
-        deflection_std_mm: Standard deviations.
-        fragments: How each is told.
+        axes: The axes in the world as rows, (3, 3).
+        motion: Rigid motion (4, 4) of the upper fragment in the world, with the lower fragment held fixed.
+        rotation_deg: Rotation vector (3,) of the motion, degrees.
+        rotation_std_deg: Its standard deviations.
+        translation_mm: Translation (3,) at the gap, mm.
+        translation_std_mm: Its standard deviations.
+        gap: The gap's position (3,) in the implant's frame.
+        heights: Heights (S,) of stations, mm from the implant's lower end.
+        deflection_mm: Displacements (S, 3) of the implant at the stations relative to the lower fragment.
+        deflection_std_mm: Their standard deviations.
+        fragments: Names of the screws in the lower and the upper fragment.
     """
 
     axes: Tensor
@@ -54,11 +54,11 @@ class RelativeMotion:
     @property
     def numbers(self) -> tuple[Tensor, Tensor]:
         """Rotation (degrees) and translation (mm), (6,), and their standard deviations."""
-        found = torch.cat([self.rotation_deg, self.translation_mm])
-        return found, torch.cat([self.rotation_std_deg, self.translation_std_mm])
+        values = torch.cat([self.rotation_deg, self.translation_mm])
+        return values, torch.cat([self.rotation_std_deg, self.translation_std_mm])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types and tensors, with units in their names."""
+        """The results as a dictionary of tensors and names, with units in the keys."""
         stations = {"height_mm": self.heights, "deflection_mm": self.deflection_mm}
         return {
             "axes": dict(zip(AXES, self.axes, strict=True)),
@@ -74,14 +74,14 @@ class RelativeMotion:
 
     def __str__(self) -> str:
         lines = []
-        for name, found, std, unit in (
+        for name, vector, std, unit in (
             ("rotation", self.rotation_deg, self.rotation_std_deg, "degrees"),
             ("translation at the gap", self.translation_mm, self.translation_std_mm, "mm"),
         ):
             parts = (
-                f"{axis} {v:.3f} +- {s:.3f}" for axis, v, s in zip(AXES, found.tolist(), std.tolist(), strict=True)
+                f"{axis} {v:.3f} +- {s:.3f}" for axis, v, s in zip(AXES, vector.tolist(), std.tolist(), strict=True)
             )
-            lines.append(f"{name} of the upper fragment ({unit}): {', '.join(parts)}; size {float(found.norm()):.3f}")
+            lines.append(f"{name} of the upper fragment ({unit}): {', '.join(parts)}; size {float(vector.norm()):.3f}")
         return "\n".join(lines)
 
 
@@ -94,16 +94,17 @@ def relative_motion(
     *,
     to_second: Tensor | None = None,
 ) -> RelativeMotion:
-    """The motion of one fragment against the other between two registrations of an implant.
+    """Motion of one bone fragment relative to the other between two registrations of an implant.
 
-    Deviations are those of both registrations, taken to be independent of each other: each of their fields is laid on
-    the warped nodes, and what it changes is summed in squares.
+    Standard deviations combine the uncertainties of both registrations, assumed independent: each displacement field of
+    their `deviations` is added to the warped points, and the squared changes of the results are summed. They are NaN if
+    a registration has no `deviations`.
 
     Args:
-        first: Mostly without load.
-        second: With it.
+        first: First registration, usually without load.
+        second: Second registration, usually with load.
         cloud: The undeformed implant in the first registration's frame.
-        fragments: In that frame; which of them is the lower one in the world is found out.
+        fragments: Fragments in the first registration's frame; exchanged if the upper one is lower in the world.
         to_second: Rigid transform (4, 4) from the first registration's frame of the implant to the second's.
     """
     nodes = cloud.points.double()
@@ -118,7 +119,7 @@ def relative_motion(
     sizes = [len(group) for group in groups]
 
     def motions(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
-        """What takes the lower fragment back, and the upper one's motion against it."""
+        """Inverse motion of the lower fragment, and motion of the upper one relative to it."""
         (low0, up0, *_), (low1, up1, *_) = before.split(sizes), after.split(sizes)
         back = invert_rigid(fit_rigid(low0, low1))
         return back, back @ fit_rigid(up0, up1)
@@ -131,33 +132,33 @@ def relative_motion(
         return torch.cat([turned, shifted, ((transform_points(back, moved) - line) @ axes.mT).flatten()])
 
     before, after = first.warp(points), second.warp(in_second)
-    found = numbers(before, after)
-    squares = torch.zeros_like(found)
+    values = numbers(before, after)
+    squares = torch.zeros_like(values)
     if first.deviations is not None:
         for field in first.deviations.at(points):
-            squares += (numbers(before + field, after) - found).square()
+            squares += (numbers(before + field, after) - values).square()
     if second.deviations is not None:
         for field in second.deviations.at(in_second):
-            squares += (numbers(before, after + field) - found).square()
+            squares += (numbers(before, after + field) - values).square()
     unknown = first.deviations is None or second.deviations is None
-    std = torch.full_like(found, torch.nan) if unknown else squares.sqrt()
+    std = torch.full_like(values, torch.nan) if unknown else squares.sqrt()
     return RelativeMotion(
         axes=axes,
         motion=motions(before, after)[1],
-        rotation_deg=found[:3],
+        rotation_deg=values[:3],
         rotation_std_deg=std[:3],
-        translation_mm=found[3:6],
+        translation_mm=values[3:6],
         translation_std_mm=std[3:6],
         gap=fragments.gap,
         heights=heights,
-        deflection_mm=found[6:].unflatten(0, (-1, 3)),
+        deflection_mm=values[6:].unflatten(0, (-1, 3)),
         deflection_std_mm=std[6:].unflatten(0, (-1, 3)),
         fragments=fragments.names,
     )
 
 
 def _axes(implant: RegisteredImplant, nodes: Tensor, upwards: Tensor) -> Tensor:
-    """The implant's axes in the world, (3, 3): across, out of plane, along; the same whatever its frame."""
+    """The implant's axes in the world, (3, 3): across, out of plane, along; independent of its frame."""
     _, (thin, _, along) = principal_axes(nodes)
     turn = fit_rigid(nodes, implant.warp(nodes))[:3, :3]
     thin, along = turn @ thin, turn @ along
@@ -166,7 +167,7 @@ def _axes(implant: RegisteredImplant, nodes: Tensor, upwards: Tensor) -> Tensor:
         shafts = torch.stack([nodes.new_tensor(s.start) - nodes.new_tensor(s.end) for s in implant.screws]).mean(0)
         outwards = turn @ shafts
     else:
-        outwards = thin * thin[thin.abs().argmax()].sign()  # whichever way points along the world's axes
+        outwards = thin * thin[thin.abs().argmax()].sign()  # without screws: towards the nearest positive world axis
     thin = thin if float(thin @ outwards) > 0 else -thin
     return torch.stack([torch.linalg.cross(thin, along), thin, along])
 

@@ -31,7 +31,7 @@ _NODES, _SURFACE_SAMPLES = 50_000, 10_000
 _LATTICE_TURN = (0.41, -0.73, 0.57)
 _WRONG_UNIT = 50.0
 _SAME_SIZE = 1.25
-_ELSEWHERE = 0.05  # of the implant's size: farther off on average, a reference stands in another frame
+_ELSEWHERE = 0.05  # of the implant's size: with a larger RMS distance, a reference is in another frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,20 +39,20 @@ class ShapeEvaluation:
     """Errors of an estimated implant against a reference, all lengths in mm.
 
     Attributes:
-        reference: "mesh", "volume" or "surface": what the reference is, the last two as point clouds.
-        nodes_before: from each node of the estimate to the nearest one of the reference; None for a cloud that covers
-            the surface only. Before the alignment there is nothing where the reference stands in another frame.
-        nodes_after: the same after the alignment.
-        node_floor: mean and RMS distance of the nodes of two perfect lattices; None where the nodes are.
-        surface_before: from the estimate's surface to that of the reference; with a surface scan, from its points to
-            the estimate's surface; None for a cloud of nodes, which has no surface.
-        surface_after: the same after the alignment.
-        alignment: rigid motion (4, 4) that lays the reference onto the estimate.
-        shift_mm: how far that moves the reference's centre.
-        angle_deg: by how much it turns it.
-        points: where the errors are (n, 3), on the estimate in the world.
-        errors: distances (n,) after the alignment: from the surface, or from the nearest node where there is none.
-        errors_before: the same before it, at the same points, where they are known.
+        reference: Kind of the reference: "mesh", "volume" or "surface". The last two are point clouds.
+        nodes_before: Distances from each node of the estimate to the nearest node of the reference, before alignment;
+            None for a surface scan. All values before the alignment are None if the reference is in another frame.
+        nodes_after: The same after the alignment.
+        node_floor: Mean and RMS distance between the nodes of two perfect lattices; None if `nodes_after` is None.
+        surface_before: Distances from the estimate's surface to that of the reference before the alignment. With a
+            surface scan, distances from its points to the estimate's surface. None for a cloud of nodes.
+        surface_after: The same after the alignment.
+        alignment: Rigid motion (4, 4) from the reference to the estimate.
+        shift_mm: Displacement of the reference's centroid by the alignment.
+        angle_deg: Rotation angle of the alignment.
+        points: Points (n, 3) of the errors, on the estimate in the world.
+        errors: Distances (n,) after the alignment, from the surface or, without a surface, from the nearest node.
+        errors_before: The same at the same points before the alignment, if known.
     """
 
     reference: str
@@ -69,7 +69,7 @@ class ShapeEvaluation:
     errors_before: Tensor | None
 
     def to_dict(self) -> dict[str, object]:
-        """The evaluation as plain data, without the single errors; what there is not is left out."""
+        """The evaluation as plain data, without the errors of single points and without values that are None."""
         names = ("nodes_before", "nodes_after", "surface_before", "surface_after")
         statistics = {name: asdict(value) for name in names if (value := getattr(self, name)) is not None}
         floor = {} if self.node_floor is None else {"node_floor_mm": dict(zip(("mean", "rms"), self.node_floor))}
@@ -78,13 +78,13 @@ class ShapeEvaluation:
 
     def __str__(self) -> str:
         lines = [f"{'error in mm':34s} {'mean':>7s} {'RMSE':>7s} {'largest':>8s} {'FWHM':>7s}"]
-        for name, what in (("surface", "node to surface"), ("nodes", "node to nearest node")):
+        for name, measure in (("surface", "node to surface"), ("nodes", "node to nearest node")):
             for when in ("before", "after"):
-                found: DistanceStatistics | None = getattr(self, f"{name}_{when}")
-                if found is not None:
+                statistics: DistanceStatistics | None = getattr(self, f"{name}_{when}")
+                if statistics is not None:
                     lines.append(
-                        f"{f'{what}, {when} CPD':34s} {found.mean_mm:7.3f} {found.rmse_mm:7.3f} "
-                        f"{found.max_mm:8.3f} {found.fwhm_mm:7.3f}"
+                        f"{f'{measure}, {when} CPD':34s} {statistics.mean_mm:7.3f} {statistics.rmse_mm:7.3f} "
+                        f"{statistics.max_mm:8.3f} {statistics.fwhm_mm:7.3f}"
                     )
         if self.node_floor is not None:
             lines.append(f"{'floor between perfect lattices':34s} {self.node_floor[0]:7.3f} {self.node_floor[1]:7.3f}")
@@ -103,20 +103,20 @@ def evaluate_shape(
     """Errors of an estimated, deformed implant against its true shape (fig. 4B of Cao et al. 2020).
 
     "The rigid coherent point drift (CPD) algorithm was applied to map the reference point cloud onto the one estimated
-    by registration. RMSEs were computed between the closest nodes" (section 2.4). CPD works on some hundred points of
-    each cloud; point-to-plane least squares on the surface goes on from there. Before the alignment the
-    errors are those of pose and shape, after it those of shape alone. Distances between nodes have a floor that half
-    a pitch sets, `nearest_node_floor`; distances to the surface have none.
+    by registration. RMSEs were computed between the closest nodes" (section 2.4). CPD uses some hundred points of
+    each cloud; point-to-plane least squares on the surface refines the result. Errors before the alignment include pose
+    and shape, errors after it shape alone. Distances between nodes have a floor of about half a pitch, see
+    `nearest_node_floor`; distances to the surface have none.
 
     Args:
-        estimate: the deformed implant's surface in the world, mm.
-        nodes: the deformed implant's nodes (N, 3).
-        reference: the true surface, or points (M, 3): nodes of a volume, as the paper has, or a scan of the surface.
-        pitch_mm: of the nodes that a reference surface is filled with.
-        reference_kind: what points are, "volume" or "surface"; found out by `fills_volume` when None.
+        estimate: The deformed implant's surface in the world, mm.
+        nodes: The deformed implant's nodes (N, 3) in the world, mm.
+        reference: The true surface, or points (M, 3): nodes of a volume, as in the paper, or a scan of the surface.
+        pitch_mm: Pitch of the nodes that fill a reference surface.
+        reference_kind: Kind of reference points, "volume" or "surface"; decided by `fills_volume` if None.
 
     Raises:
-        ValueError: a cloud or a mesh is empty or not finite, or the reference is so much larger or smaller that it
+        ValueError: A cloud or a mesh is empty or not finite, or the reference is so much larger or smaller that it
             cannot be in mm.
     """
     nodes = finite_cloud(nodes, "nodes")
@@ -128,7 +128,7 @@ def evaluate_shape(
     elsewhere = not torch.equal(start, torch.eye(4, dtype=torch.float64))
     before = _Errors(None, None) if elsewhere else _errors(true, estimate, nodes, start)
     after = _errors(true, estimate, nodes, alignment)
-    where, errors = after.surface or after.nodes or (nodes, nodes[:, 0])  # there is one or the other
+    error_points, errors = after.surface or after.nodes or (nodes, nodes[:, 0])  # at least one of them is there
     earlier = before.surface or before.nodes
     return ShapeEvaluation(
         reference=true.kind,
@@ -142,7 +142,7 @@ def evaluate_shape(
         alignment=alignment,
         shift_mm=float((transform_points(alignment, centre[None]) - centre).norm()),
         angle_deg=math.degrees(float(vector_from_rotation(alignment[:3, :3]).norm())),
-        points=where,
+        points=error_points,
         errors=errors,
         errors_before=earlier[1] if earlier else None,
     )
@@ -150,7 +150,7 @@ def evaluate_shape(
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """A true shape: its kind, its points, those of them that outline it, and its surface where that is known."""
+    """A true shape: its kind, its points, points of its outline, and its surface if known."""
 
     kind: str
     points: Tensor
@@ -160,14 +160,14 @@ class _Reference:
 
 @dataclass(frozen=True, eq=False)
 class _Errors:
-    """Points of the estimate or near it, and their distances, for each measure."""
+    """Points on or near the estimate and their distances, for each measure."""
 
     nodes: tuple[Tensor, Tensor] | None
     surface: tuple[Tensor, Tensor] | None
 
     def statistics(self, measure: str) -> DistanceStatistics | None:
-        found: tuple[Tensor, Tensor] | None = getattr(self, measure)
-        return None if found is None else distance_statistics(found[1])
+        errors: tuple[Tensor, Tensor] | None = getattr(self, measure)
+        return None if errors is None else distance_statistics(errors[1])
 
 
 def _reference(
@@ -184,9 +184,9 @@ def _reference(
 
 
 def _turned_lattice(mesh: trimesh.Trimesh, pitch_mm: float) -> Tensor:
-    """Nodes (M, 3) of a surface on a lattice that is parallel to nothing.
+    """Nodes (M, 3) that fill a surface, on an obliquely turned lattice.
 
-    The estimate's nodes come from a lattice too. Were both parallel, nodes of a shifted shape could coincide.
+    The estimate's nodes are on a lattice too. If both were parallel, nodes of a shifted shape could coincide.
     """
     turn = rigid_matrix(torch.tensor(_LATTICE_TURN, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     turned = mesh.copy()
@@ -195,15 +195,15 @@ def _turned_lattice(mesh: trimesh.Trimesh, pitch_mm: float) -> Tensor:
 
 
 def _check_size(nodes: Tensor, points: Tensor) -> None:
-    own, other = (float((p.amax(0) - p.amin(0)).norm()) for p in (nodes, points))
-    if not own / _WRONG_UNIT < other < own * _WRONG_UNIT:
+    implant_size, reference_size = (float((p.amax(0) - p.amin(0)).norm()) for p in (nodes, points))
+    if not implant_size / _WRONG_UNIT < reference_size < implant_size * _WRONG_UNIT:
         raise ValueError(
-            f"the reference is {other:.4g} mm from corner to corner and the implant {own:.4g} mm: "
+            f"the reference is {reference_size:.4g} mm from corner to corner and the implant {implant_size:.4g} mm: "
             "both must be in mm (is the reference in metres?)"
         )
-    if not own / _SAME_SIZE < other < own * _SAME_SIZE:
+    if not implant_size / _SAME_SIZE < reference_size < implant_size * _SAME_SIZE:
         warnings.warn(
-            f"the reference is {other:.4g} mm from corner to corner and the implant {own:.4g} mm: "
+            f"the reference is {reference_size:.4g} mm from corner to corner and the implant {implant_size:.4g} mm: "
             "are they the same part, and all of it?",
             stacklevel=4,
         )
@@ -215,7 +215,7 @@ def _surface_samples(mesh: trimesh.Trimesh) -> Tensor:
 
 
 def _start(points: Tensor, fixed: Tensor) -> Tensor:
-    """Where to start aligning the reference's points: as they are, or by principal axes if they are elsewhere."""
+    """Start (4, 4) of the alignment: identity, or alignment of the principal axes if the reference is elsewhere."""
     given = torch.eye(4, dtype=torch.float64)
     points, target = thinned(points, 2000), thinned(fixed, 20_000)
     size = float((fixed.amax(0) - fixed.amin(0)).norm())
@@ -226,28 +226,28 @@ def _start(points: Tensor, fixed: Tensor) -> Tensor:
     if misfit(given) < _ELSEWHERE * size:
         return given
     warnings.warn(
-        "the reference stands in another frame than the implant: there are no errors before the alignment, and that "
-        "starts from the principal axes (which may turn a symmetric implant round)",
+        "the reference is in another frame than the implant: no errors before the alignment are given, and the "
+        "alignment starts from the principal axes (a symmetric implant may be turned round)",
         stacklevel=3,
     )
     return min(principal_motions(points, target), key=misfit)
 
 
 def _alignment(true: _Reference, fixed: Tensor, estimate: trimesh.Trimesh, start: Tensor) -> Tensor:
-    """The rigid motion (4, 4) that lays the reference onto the estimate."""
+    """Rigid motion (4, 4) from the reference to the estimate."""
     drift = rigid_coherent_point_drift(transform_points(start, true.points), fixed) @ start
     outline = transform_points(drift, true.outline)
     return align_to_surface(outline, estimate, inset=true.kind == "volume") @ drift
 
 
 def _errors(true: _Reference, estimate: trimesh.Trimesh, nodes: Tensor, alignment: Tensor) -> _Errors:
-    """Errors with the reference moved by ``alignment``."""
+    """Errors after the reference is moved by `alignment`."""
     if true.kind == "surface":
         moved = transform_points(alignment, thinned(true.points, _SURFACE_SAMPLES))
         return _Errors(None, (moved, surface_distances(moved, estimate)))
     back = invert_rigid(alignment)
-    some = thinned(nodes, _NODES)
-    to_nodes = some, nearest_node_distances(transform_points(back, some), true.points)
+    sample = thinned(nodes, _NODES)
+    to_nodes = sample, nearest_node_distances(transform_points(back, sample), true.points)
     if true.mesh is None:
         return _Errors(to_nodes, None)
     samples = _surface_samples(estimate)

@@ -15,16 +15,16 @@ _MOST_BINS = 200_000
 
 @dataclass(frozen=True)
 class DistanceStatistics:
-    """What a set of distances comes to, all in mm.
+    """Statistics of a set of distances, all in mm.
 
     Attributes:
-        num_points: how many distances.
-        mean_mm: mean.
-        rmse_mm: root mean square.
-        max_mm: largest.
-        fwhm_mm: full width of the histogram at half its maximum.
-        counts: distances in each bin of the histogram.
-        edges_mm: edges of the bins, one more.
+        num_points: Number of distances.
+        mean_mm: Mean distance.
+        rmse_mm: Root mean square distance.
+        max_mm: Largest distance.
+        fwhm_mm: Full width of the histogram at half its maximum.
+        counts: Number of distances in each bin of the histogram.
+        edges_mm: Edges of the bins, one more than there are bins.
     """
 
     num_points: int
@@ -49,7 +49,7 @@ def distance_statistics(distances: Tensor, *, num_bins: int = 60) -> DistanceSta
     """Mean, RMSE, largest, FWHM and histogram of distances (N,) in mm.
 
     Raises:
-        ValueError: there is no distance, or one is negative or not finite.
+        ValueError: There is no distance, or one is negative or not finite.
 
     >>> import torch
     >>> print(distance_statistics(torch.tensor([0.1, 0.1, 0.1])))
@@ -81,12 +81,12 @@ def full_width_at_half_maximum(values: Tensor, *, lowest: float | None = None) -
     distribution it is 2.355 standard deviations, and the kernel widens it by under 1 % for 10^4 values.
 
     Args:
-        values: (N,), at least one.
-        lowest: no value can be below it: the density is mirrored there, so that it does not fall off towards it, and
-            the width begins there where the density still is above half its maximum.
+        values: Values (N,), at least one.
+        lowest: Lower bound of the values. The density is mirrored there, so that it does not fall off towards it.
+            The width starts at the bound if the density there is above half its maximum.
 
     Raises:
-        ValueError: there is no value, or one is not finite or below ``lowest``.
+        ValueError: There is no value, or one is not finite or below `lowest`.
     """
     array = np.asarray(values.detach().cpu().double())
     if array.ndim != 1 or len(array) == 0 or not np.isfinite(array).all():
@@ -97,7 +97,7 @@ def full_width_at_half_maximum(values: Tensor, *, lowest: float | None = None) -
     spread = min(array.std(), (high - low) / 1.349) or array.std()
     bandwidth = 0.9 * spread * len(array) ** -0.2
     if not bandwidth > 1e-12 * max(1.0, float(np.abs(array).max())):
-        return 0.0  # all the same
+        return 0.0  # all values are equal
     return _width(array, bandwidth, lowest)
 
 
@@ -113,13 +113,13 @@ def _width(array: NDArray, bandwidth: float, lowest: float | None) -> float:
     half = density[peak] / 2
     right = _crossing(density[peak:], half)
     left = _crossing(density[peak::-1], half)
-    if left is None:  # above half as far as values go
+    if left is None:  # above half down to the smallest value
         left = peak + 0.5
     return float(step * (left + (right if right is not None else bins - peak - 0.5)))
 
 
 def _crossing(falling: NDArray, half: float) -> float | None:
-    """Where, in bins from the first, a density falls below half; None where it does not."""
+    """Position in bins from the first one where a density falls below half; None if it does not."""
     below = np.nonzero(falling < half)[0]
     if len(below) == 0:
         return None

@@ -1,7 +1,7 @@
 """Cone-beam geometry: projection matrices, the multisource scanner, rigid motions and voxel grids.
 
-The world is right-handed in mm with z along the gantry's axis; a view is one 3 x 4 projection matrix, and everything
-else about it (source, rays, pixel positions) is derived from that.
+World coordinates are right-handed, in mm, with z along the gantry's rotation axis. A view is one 3 x 4 projection
+matrix; its source, rays and pixel positions are derived from that.
 """
 
 from .calibration import Calibration, calibrate

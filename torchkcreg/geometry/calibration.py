@@ -1,4 +1,4 @@
-"""Where the detector really stands: calibration of a scan's geometry from the tracks of beads across its views."""
+"""Geometric calibration: the detector's true position from the tracks of beads across the views of a scan."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .cone_beam import ConeBeamGeometry
 from .frames import DetectorFrames
 from .se3 import rotation_from_vector
 
-LIKELY_SHIFT_MM = 20.0  # standard deviations of what is told about a detector's place
-LIKELY_DISTANCE = 0.05  # as a share of the distance from the source
+LIKELY_SHIFT_MM = 20.0  # prior standard deviations of the detector's nominal position
+LIKELY_DISTANCE = 0.05  # relative to the source-detector distance
 LIKELY_TURN_DEG = 2.0
 LEAST_NOISE_PX = 0.02
 PARAMETERS = ("shift_u_mm", "shift_v_mm", "shift_depth_mm", "turn_u_deg", "turn_v_deg", "turn_normal_deg")
@@ -23,19 +23,19 @@ PARAMETERS = ("shift_u_mm", "shift_v_mm", "shift_depth_mm", "turn_u_deg", "turn_
 
 @dataclass(frozen=True)
 class Calibration:
-    """A geometry made to fit the tracks of beads.
+    """A geometry calibrated with the tracks of beads.
 
     Attributes:
-        geometry: the views as they were found to be.
-        beads: positions in the world, (N, 3) mm.
-        detector: by how much the detector stands elsewhere, the same in all views: shifts along columns (u), rows (v)
-            and away from the source in mm; turns about its column axis, row axis and normal (away from the source)
-            in degrees.
-        deviations: their standard deviations, from the tracks' own scatter; a likely misplacement's where the tracks
-            say nothing.
-        residuals: measured less modelled positions (V, N, 2) in pixels, NaN where a bead was not seen.
-        median_px: median length of the residuals, pixels.
-        before_px: the same of the geometry as it was told, with the beads where they fit it best.
+        geometry: The calibrated views.
+        beads: Bead positions in the world, (N, 3) mm.
+        detector: Displacement of the detector from its nominal position, the same in all views: shifts along u, along
+            v and away from the source in mm; rotations about its column axis, row axis and normal (which points away
+            from the source) in degrees.
+        deviations: Standard deviations of these six numbers, from the scatter of the residuals. Where the tracks hold
+            no information it is that of the prior.
+        residuals: Measured minus modelled positions (V, N, 2) in pixels, NaN where a bead was not seen.
+        median_px: Median length of the residuals in pixels.
+        before_px: The same for the nominal geometry with best-fitting beads.
     """
 
     geometry: ConeBeamGeometry
@@ -48,20 +48,21 @@ class Calibration:
 
 
 def calibrate(geometry: ConeBeamGeometry, tracks: Tensor) -> Calibration:
-    """The place of the detector in which tracks of beads fit best, and the beads' places.
+    """Fit the detector's position and the bead positions to the tracks of beads.
 
-    The gantry's angles and the distance of the source from the axis count as known: they set the unit of length. The
-    detector moves as one rigid body, in the same way in all views, from where the geometry has it; a robust least
-    squares fit of its six parameters and of the beads' positions counts outliers little, and holds what the tracks do
-    not tell near what was told. Two beads at different heights are enough for all but the tilts (turns about u and v).
+    The gantry angles and the source-axis distance are taken as known; they set the scale. The detector is displaced
+    from its nominal position as one rigid body, in the same way in all views. Its six parameters and the bead positions
+    are fitted by robust least squares, which gives outliers little weight. A weak prior holds parameters that the
+    tracks do not determine near their nominal values. Two beads at different heights determine all but the tilts
+    (rotations about u and v).
 
     Args:
-        geometry: as it is told, such as a `circular_geometry` of measured lengths.
-        tracks: position (u, v) of each bead in each view, pixels, (V, N, 2); NaN where it was not seen.
+        geometry: Nominal geometry, such as a `circular_geometry` of measured lengths.
+        tracks: Position (u, v) of each bead in each view in pixels, (V, N, 2); NaN where it was not seen.
 
     Raises:
-        ValueError: tracks of another shape, a bead that fewer than three views see, or tracks that the geometry does
-            not fit at all: residuals stay above two hundredths of the detector.
+        ValueError: The tracks have another shape, a bead is seen in fewer than three views, or the geometry does not
+            fit: the median residual stays above 2 % of the detector's longer side.
 
     >>> from torchkcreg.geometry import circular_geometry
     >>> angles, size = range(0, 360, 10), {"sad": 404, "sdd": 538, "det_shape": (64, 64), "pixel_spacing": (2.0, 2.0)}
@@ -79,14 +80,14 @@ def calibrate(geometry: ConeBeamGeometry, tracks: Tensor) -> Calibration:
         raise ValueError(f"each bead must be seen in three views or more, got {seen.sum(0).tolist()}")
     fit = _Fit(geometry, measured, seen)
     start = np.concatenate([np.zeros(6), fit.triangulated(geometry).ravel()])
-    told = fit.solved(start, free=slice(6, None))
-    before = float(np.median(fit.lengths(told)))
-    best = fit.solved(told, free=slice(0, None))
+    nominal = fit.solved(start, free=slice(6, None))
+    before = float(np.median(fit.lengths(nominal)))
+    best = fit.solved(nominal, free=slice(0, None))
     lengths = fit.lengths(best)
     if (median := float(np.median(lengths))) > 0.02 * max(geometry.det_shape):
         raise ValueError(
-            f"no place of the detector fits the tracks: they stay {median:.1f} px off; are the angles, and the sense "
-            "in which they count, those of the views?"
+            f"no detector position fits the tracks: the median residual is {median:.1f} px; check the gantry angles "
+            "and the direction of rotation"
         )
     residuals = np.full(measured.shape, np.nan)
     residuals[seen] = fit.residuals(best)
@@ -98,7 +99,7 @@ def calibrate(geometry: ConeBeamGeometry, tracks: Tensor) -> Calibration:
 
 
 class _Fit:
-    """Residuals of tracks (V, N, 2) for the detector's six parameters and the beads' positions, one vector."""
+    """Least-squares fit of tracks (V, N, 2); the parameters x are the detector's six, then the bead positions."""
 
     def __init__(self, geometry: ConeBeamGeometry, measured: NDArray, seen: NDArray) -> None:
         self.geometry, self.measured, self.seen = geometry, measured, seen
@@ -113,7 +114,7 @@ class _Fit:
         self.noise = 1.0
 
     def placed(self, x: NDArray) -> ConeBeamGeometry:
-        """The geometry with the detector in its place."""
+        """The geometry with the detector displaced by the parameters."""
         geometry, move = self.geometry, torch.from_numpy(x[:6])
         turn = rotation_from_vector(self.frames @ move[3:].deg2rad())
         dv, du = geometry.pixel_spacing
@@ -122,15 +123,16 @@ class _Fit:
         return moved.geometry(geometry.det_shape, sources=geometry.sources, angles_deg=geometry.angles_deg)
 
     def residuals(self, x: NDArray) -> NDArray:
-        """Measured less modelled, pixels, of what was seen, (n, 2)."""
+        """Measured minus modelled positions (n, 2) in pixels, of the bead images that were seen."""
         uv, _ = self.placed(x).project(torch.from_numpy(x[6:].reshape(-1, 3)))
         return (self.measured - uv.numpy())[self.seen]
 
     def lengths(self, x: NDArray) -> NDArray:
+        """Lengths (n,) of the residuals, pixels."""
         return np.linalg.norm(self.residuals(x), axis=-1)
 
     def solved(self, start: NDArray, *, free: slice) -> NDArray:
-        """The parameters that fit best, some of them free; twice, as the first fit tells how large the noise is."""
+        """Best-fitting parameters, only `free` ones varied; fitted twice, as the first fit estimates the noise."""
         x = start.copy()
 
         def cost(values: NDArray) -> NDArray:
@@ -156,7 +158,7 @@ class _Fit:
         return np.sqrt(np.diag(np.linalg.pinv(information))[:6])
 
     def triangulated(self, geometry: ConeBeamGeometry) -> NDArray:
-        """Where the rays of each bead's track come closest to each other, (N, 3)."""
+        """Point (N, 3) closest to all rays of each bead's track."""
         inverse = torch.linalg.inv(geometry.projection_matrices.detach().cpu()[:, :, :3]).numpy()
         points = []
         for bead in range(self.measured.shape[1]):

@@ -1,4 +1,4 @@
-"""Projection matrices of a gantry that turns about the z axis, and of any source and detector given as vectors."""
+"""Projection matrices of a gantry that rotates about the z axis, and of sources and detectors given as vectors."""
 
 from __future__ import annotations
 
@@ -22,19 +22,17 @@ def matrices_from_frames(
     """Projection matrices (V, 3, 4), float64, of flat detectors given by world vectors (V, 3) in mm.
 
     Args:
-        sources: positions of the focal spots.
-        det_centers: positions of the detectors' centres, that is of pixel ``((cols - 1)/2, (rows - 1)/2)``.
-        col_axes: unit vectors along which the column index u grows.
-        row_axes: unit vectors along which the row index v grows; not parallel to the column axes.
+        sources: Positions of the focal spots.
+        det_centers: Positions of the detectors' centres, that is, of pixel `((cols - 1)/2, (rows - 1)/2)`.
+        col_axes: Unit vectors of increasing column index u.
+        row_axes: Unit vectors of increasing row index v; not parallel to the column axes.
         det_shape: (rows, cols).
         pixel_spacing: (dv, du) in mm.
 
-    The ray to a pixel is ``center - source + (u - u_c) du a + (v - v_c) dv b``: a linear map of (u, v, 1), and M is its
+    The ray to a pixel is `center - source + (u - u_c) du a + (v - v_c) dv b`: a linear map of (u, v, 1). M is its
     inverse up to scale.
     """
-    columns = [
-        du_axis.double() * step for du_axis, step in ((col_axes, pixel_spacing[1]), (row_axes, pixel_spacing[0]))
-    ]
+    columns = [axis.double() * step for axis, step in ((col_axes, pixel_spacing[1]), (row_axes, pixel_spacing[0]))]
     u_center, v_center = (det_shape[1] - 1) / 2, (det_shape[0] - 1) / 2
     corner = det_centers.double() - sources.double() - u_center * columns[0] - v_center * columns[1]
     inverse = torch.linalg.inv(torch.stack([columns[0], columns[1], corner], dim=-1))
@@ -42,7 +40,7 @@ def matrices_from_frames(
 
 
 def gantry_axes(radians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit vectors (V, 3) towards a source that turns about z from x, along its way, and up."""
+    """Unit vectors (V, 3) at gantry angles (V,): from the z axis towards the source, along its motion, and along +z."""
     zero = torch.zeros_like(radians)
     radial = torch.stack([radians.cos(), radians.sin(), zero], dim=-1)
     along = torch.stack([-radians.sin(), radians.cos(), zero], dim=-1)
@@ -60,22 +58,22 @@ def circular_geometry(
     det_offset_mm: Sequence[float] = (0.0, 0.0),
     sources: Sequence[str] | None = None,
 ) -> ConeBeamGeometry:
-    """Geometry of a gantry turning about z: view at angle b has its source at ``(sad cos b, sad sin b, z_s)``.
+    """Geometry of a gantry rotating about z: at angle b the source is at `(sad cos b, sad sin b, z_s)`.
 
-    The detector's centre is at ``-(sdd - sad) (cos b, sin b, 0)``, u runs along ``(-sin b, cos b, 0)`` and v along +z.
+    The detector's centre is at `-(sdd - sad) (cos b, sin b, 0)`, u runs along `(-sin b, cos b, 0)` and v along +z.
 
     Args:
-        angles_deg: gantry angles, one a view.
-        sad: distance from source to axis in mm.
-        sdd: distance from source to detector in mm.
+        angles_deg: Gantry angles, one per view.
+        sad: Distance from source to rotation axis in mm.
+        sdd: Distance from source to detector in mm.
         det_shape: (rows, cols).
         pixel_spacing: (dv, du) in mm.
-        source_z_mm: height of the source above the centre of the detector, one for all views or one each.
-        det_offset_mm: shift (along v, along u) of the detector from its place.
-        sources: label of each view's source.
+        source_z_mm: Height of the source above the plane z = 0; one number, or one per view.
+        det_offset_mm: Shift (along v, along u) of the detector from its centred position.
+        sources: Name of each view's source.
 
     Raises:
-        ValueError: not 0 < sad < sdd, or counts that do not match.
+        ValueError: Not 0 < sad < sdd, or counts that do not match.
 
     >>> circular_geometry(range(0, 360, 90), sad=404, sdd=538, det_shape=(64, 32), pixel_spacing=(2.0, 2.0))
     ConeBeamGeometry(num_views=4, det_shape=(64, 32), pixel_spacing=(2, 2))

@@ -1,4 +1,4 @@
-"""`ConeBeamGeometry`: a set of views, one 3 x 4 projection matrix each, and everything that follows from them."""
+"""`ConeBeamGeometry`: views given by 3 x 4 projection matrices, with their sources, rays and pixel positions."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from .orientation import checked_matrices, checked_shape, looking_signs, turned_
 
 
 class ConeBeamGeometry(ExactModule):
-    """Views of a cone-beam system: ``u = P0.X / P2.X`` (column), ``v = P1.X / P2.X`` (row), X = (x, y, z, 1) in mm.
+    """Views of a cone-beam system: `u = P0.X / P2.X` (column), `v = P1.X / P2.X` (row), X = (x, y, z, 1) in mm.
 
-    The matrices are the truth about a view; with ``P = [M | m]``, the source is at ``-M^-1 m`` and the ray of pixel
-    (u, v) runs along ``M^-1 (u, v, 1)``. Pixel centres lie at integers, counted from 0. On construction each matrix is
-    scaled so that its row 2 gives the depth in mm along the detector's normal, positive in front of the source: where
-    the views' central rays meet, see `looking_signs`. Any invertible M will do: tilted detectors, cropped images, rows
-    that run up or down, a world whose origin is at or behind a source.
+    A view is defined by its matrix `P = [M | m]`: the source is at `-M^-1 m` and the ray of pixel (u, v) has the
+    direction `M^-1 (u, v, 1)`. Pixel centres are at integers, counted from 0. On construction each matrix is scaled so
+    that its row 2 gives the depth in mm along the detector's normal. Depths are positive in front of the source, on the
+    side where the views' central rays meet (see `looking_signs`). Any invertible M is valid: tilted detectors, cropped
+    images, rows that run up or down, a world origin at or behind a source.
 
     Args:
         projection_matrices: (V, 3, 4), any scale and sign.
         det_shape: (rows, cols) of every image.
         pixel_spacing: (dv, du) in mm, between rows and between columns.
-        sources: a label for each view, the focal spot that fired it.
-        angles_deg: gantry angle of each view, used to select views only.
+        sources: Name of each view's focal spot.
+        angles_deg: Gantry angle of each view, used only to select views.
 
     Attributes:
-        projection_matrices: buffer (V, 3, 4), float64 whatever the module is cast to.
-        knows_front: whether the views themselves tell what is in front of them; else :meth:`facing` may.
+        projection_matrices: Buffer (V, 3, 4), float64 whatever the module is cast to.
+        knows_front: True if the signs of the depths follow from the views themselves; otherwise `facing` can set them.
 
     Raises:
-        ValueError: shapes, labels or numbers that don't make a geometry.
+        ValueError: Shapes, labels or numbers that do not make a geometry.
 
     >>> from torchkcreg.geometry import circular_geometry
     >>> geometry = circular_geometry([0.0, 90.0], sad=404, sdd=538, det_shape=(768, 768), pixel_spacing=(0.39, 0.39))
@@ -83,7 +83,7 @@ class ConeBeamGeometry(ExactModule):
                 raise ValueError(f"{name} must have one entry for each of the {len(matrices)} views, got {len(labels)}")
 
     def _derived(self, matrices: Tensor, **changes: object) -> ConeBeamGeometry:
-        """This geometry with other matrices; unlike the constructor, the sign of the depth stays as it is."""
+        """This geometry with other matrices. Unlike the constructor it does not change the sign of the depth."""
         names = ("det_shape", "pixel_spacing", "sources", "angles_deg", "knows_front")
         fields: dict = {name: getattr(self, name) for name in names}
         geometry = ConeBeamGeometry.__new__(ConeBeamGeometry)
@@ -92,6 +92,7 @@ class ConeBeamGeometry(ExactModule):
         return geometry
 
     def extra_repr(self) -> str:
+        """Counts of views and pixels for `repr`."""
         dv, du = self.pixel_spacing
         text = f"num_views={self.num_views}, det_shape={self.det_shape}, pixel_spacing=({dv:g}, {du:g})"
         if self.sources is not None:
@@ -114,11 +115,12 @@ class ConeBeamGeometry(ExactModule):
     def detector_distances(self) -> Tensor:
         """Distances (V,) in mm from source to detector plane along its normal (SDD).
 
-        The matrix fixes the rays, the pixel spacing where the detector stands along them: a step of one column moves
-        the end of the ray by ``depth * |M^-1 e_u|``, which is du on the detector only.
+        The matrix determines the rays; the pixel spacing determines where the detector intersects them. One column
+        changes the end of the ray by `depth * |M^-1 e_u|`, which equals du on the detector.
 
         Raises:
-            ValueError: rows and columns put it at distances more than 0.1 % apart: the spacing does not fit the matrix.
+            ValueError: Row and column spacing give distances that differ by more than 0.1 %, so they do not fit the
+                matrix.
         """
         steps = torch.linalg.inv(self.projection_matrices[:, :, :3])[:, :, :2].norm(dim=1)  # (V, 2): du, dv
         distances = steps.new_tensor(self.pixel_spacing[::-1]) / steps
@@ -127,7 +129,7 @@ class ConeBeamGeometry(ExactModule):
         return distances.mean(1)
 
     def rays(self) -> Tensor:
-        """Vectors (V, rows, cols, 3) from source to pixel centre at depth 1 mm: ``M^-1 (u, v, 1)``."""
+        """Vectors (V, rows, cols, 3) from source to pixel centre at depth 1 mm: `M^-1 (u, v, 1)`."""
         inverse = torch.linalg.inv(self.projection_matrices[:, :, :3])
         rows, cols = self.det_shape
         u = torch.arange(cols, dtype=inverse.dtype, device=inverse.device)
@@ -137,11 +139,11 @@ class ConeBeamGeometry(ExactModule):
         return along_u + along_v + inverse[:, None, None, :, 2]
 
     def pixel_positions(self) -> Tensor:
-        """World positions (V, rows, cols, 3) in mm of the pixel centres; see `detector_distances` for where that is."""
+        """World positions (V, rows, cols, 3) in mm of the pixel centres, at `detector_distances` from the source."""
         return self.source_positions[:, None, None] + self.detector_distances[:, None, None, None] * self.rays()
 
     def obliquity(self) -> Tensor:
-        """One over the cosine of each pixel's ray with the detector's normal, (V, rows, cols): ``|M^-1 (u, v, 1)|``."""
+        """1 / cosine of the angle between ray and detector normal, (V, rows, cols): `|M^-1 (u, v, 1)|`."""
         return self.rays().norm(dim=-1)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -159,15 +161,16 @@ class ConeBeamGeometry(ExactModule):
     def facing(self, points: Tensor) -> ConeBeamGeometry:
         """The geometry with these world points (N, 3) in front of every source.
 
-        Views that do not tell themselves what is in front (see `knows_front`) are turned so that the points' mean is.
+        If the front of the views is not known (see `knows_front`), the signs of the matrices are chosen so that the
+        mean of the points has a positive depth.
 
         Raises:
-            ValueError: a point lies at or behind a source.
+            ValueError: A point lies at or behind a source.
         """
         return self._derived(turned_towards(self.projection_matrices, points, keep=self.knows_front))
 
     def select(self, views: Sequence[int] | slice) -> ConeBeamGeometry:
-        """The geometry of some views, in the order given; labels stay with their views."""
+        """The geometry of selected views, in the order given, with their labels."""
         if isinstance(views, slice):
             views = range(self.num_views)[views]
         chosen = [int(view) for view in views]
@@ -180,14 +183,16 @@ class ConeBeamGeometry(ExactModule):
         return self._derived(self.projection_matrices[chosen], **labels)
 
     def nearest_views(self, angles_deg: Sequence[float], sources: Sequence[str] | str | None = None) -> list[int]:
-        """Indices of the views nearest to gantry angles (mod 360), optionally among the views of a source each.
+        """Indices of the views nearest to gantry angles (mod 360), optionally restricted to views of given sources.
+
+        Of two views equally near, the first is taken.
 
         Args:
-            angles_deg: the angles asked for.
-            sources: one label for all angles, or one for each. Of two views equally near the first counts.
+            angles_deg: Gantry angles to look for.
+            sources: One source name for all angles, or one per angle.
 
         Raises:
-            ValueError: the geometry lacks the labels, or no view has the source asked for.
+            ValueError: The geometry lacks the labels, or no view has the given source.
 
         >>> from torchkcreg.geometry import MultisourceScanner
         >>> MultisourceScanner().geometry().nearest_views([91, 451, 91], sources=["T1", "T2", "T3"])
@@ -195,21 +200,21 @@ class ConeBeamGeometry(ExactModule):
         """
         if self.angles_deg is None or (sources is not None and self.sources is None):
             raise ValueError("nearest_views needs a geometry with angles_deg (and sources, to choose by source)")
-        wanted = [sources] * len(angles_deg) if sources is None or isinstance(sources, str) else list(sources)
-        if len(wanted) != len(angles_deg):
-            raise ValueError(f"sources must have one entry for each of {len(angles_deg)} angles, got {len(wanted)}")
+        names = [sources] * len(angles_deg) if sources is None or isinstance(sources, str) else list(sources)
+        if len(names) != len(angles_deg):
+            raise ValueError(f"sources must have one entry for each of {len(angles_deg)} angles, got {len(names)}")
         nearest = []
-        for angle, source in zip(angles_deg, wanted):
+        for angle, source in zip(angles_deg, names):
             candidates = [i for i in range(self.num_views) if source is None or (self.sources or ())[i] == source]
             if not candidates:
                 raise ValueError(f"sources must be among {sorted(set(self.sources or ()))}, got {source!r}")
-            # rounded, so that views equally near stay equal whatever the arithmetic
+            # rounded, so that rounding errors do not decide between views equally near
             apart = [round(abs((self.angles_deg[i] - angle + 180) % 360 - 180), 9) for i in candidates]
             nearest.append(candidates[apart.index(min(apart))])
         return nearest
 
     def crop(self, rows: slice, cols: slice) -> ConeBeamGeometry:
-        """The geometry of images cropped to ``[rows, cols]``; the rays of the pixels that stay do not change."""
+        """The geometry of images cropped to `[rows, cols]`; the rays of the remaining pixels do not change."""
         starts, sizes = [], []
         for name, part, count in (("rows", rows, self.det_shape[0]), ("cols", cols, self.det_shape[1])):
             start, stop, step = part.indices(count)
@@ -220,9 +225,9 @@ class ConeBeamGeometry(ExactModule):
         return self._derived(self._rescaled(starts, 1.0), det_shape=sizes)
 
     def bin(self, factor: int) -> ConeBeamGeometry:
-        """The geometry of images averaged over blocks of ``factor x factor`` pixels; rows and cols left over are lost.
+        """The geometry of images averaged over blocks of `factor x factor` pixels; incomplete blocks are dropped.
 
-        Centres of binned pixels are the centres of their blocks: ``u' = (u - (factor - 1)/2) / factor``.
+        The centre of a binned pixel is the centre of its block: `u' = (u - (factor - 1)/2) / factor`.
         """
         if int(factor) != factor or not 1 <= factor <= min(self.det_shape):
             raise ValueError(f"factor must be an integer from 1 to {min(self.det_shape)}, got {factor}")
@@ -231,7 +236,7 @@ class ConeBeamGeometry(ExactModule):
         return self._derived(matrices, det_shape=det_shape, pixel_spacing=[d * factor for d in self.pixel_spacing])
 
     def refined(self, factor: int) -> ConeBeamGeometry:
-        """The geometry of pixels ``factor`` times finer, ``u' = factor u + (factor - 1)/2``; undoes :meth:`bin`."""
+        """The geometry with pixels `factor` times finer, `u' = factor u + (factor - 1)/2`; undoes `bin`."""
         if int(factor) != factor or factor < 1:
             raise ValueError(f"factor must be a positive integer, got {factor}")
         matrices = self._rescaled([-(factor - 1) / (2 * factor)] * 2, factor)
@@ -239,16 +244,17 @@ class ConeBeamGeometry(ExactModule):
         return self._derived(matrices, det_shape=det_shape, pixel_spacing=[d / factor for d in self.pixel_spacing])
 
     def _rescaled(self, start: Sequence[float], factor: float) -> Tensor:
-        """Matrices for pixels ``(uv - start) * factor``; start is (v, u)."""
+        """Matrices for pixels `(uv - start) * factor`; start is (v, u)."""
         matrices = self.projection_matrices
         change = torch.diag(matrices.new_tensor([factor, factor, 1.0]))
         change[0, 2], change[1, 2] = -start[1] * factor, -start[0] * factor
         return change @ matrices
 
     def moved(self, transform: Tensor) -> ConeBeamGeometry:
-        """The geometry that sees a world moved by an affine transform (4, 4), or (V, 4, 4) for one a view: ``P T``.
+        """The geometry for a world moved by an affine transform (4, 4), or (V, 4, 4) for one per view: `P T`.
 
-        ``geometry.moved(T).project(x)`` is ``geometry.project(T x)``: instead of the implant, move the gantry back.
+        `geometry.moved(T).project(x)` is `geometry.project(T x)`: moving the implant by T is the same as moving the
+        gantry by its inverse.
         """
         if tuple(transform.shape) not in ((4, 4), (self.num_views, 4, 4)):
             raise ValueError(f"transform must have shape (4, 4) or (V, 4, 4), got {tuple(transform.shape)}")

@@ -1,4 +1,4 @@
-"""Views as vectors in the world: focal spot, detector centre, steps of its pixels."""
+"""Views as world vectors (focal spot, detector centre, pixel steps), and the change of a gantry's axis to z."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torch import Tensor
 from .circular import matrices_from_frames
 from .cone_beam import ConeBeamGeometry
 
-ALIKE = 1e-4  # how much pixel steps may differ from view to view, as a share
+ALIKE = 1e-4  # relative tolerance of pixel steps between views
 
 
 @dataclass(frozen=True)
 class DetectorFrames:
-    """Where source and detector of each view are, in world mm; all (V, 3), float64.
+    """Source and detector position of each view in world mm; all (V, 3), float64.
 
     Attributes:
-        sources: focal spots.
-        centers: middles of the detectors, of pixel ``((cols - 1)/2, (rows - 1)/2)``.
-        col_steps: from a pixel's centre to that of the next column.
-        row_steps: from a pixel's centre to that of the next row.
+        sources: Focal spots.
+        centers: Detector centres, at pixel `((cols - 1)/2, (rows - 1)/2)`.
+        col_steps: Vectors from one pixel centre to that in the next column.
+        row_steps: Vectors from one pixel centre to that in the next row.
     """
 
     sources: Tensor
@@ -32,10 +32,10 @@ class DetectorFrames:
 
     @classmethod
     def of(cls, geometry: ConeBeamGeometry) -> DetectorFrames:
-        """Of a geometry; its pixel spacing says where along the rays the detector is.
+        """Frames of a geometry. Its pixel spacing determines the distance of the detector from the source.
 
         Raises:
-            ValueError: the spacing does not fit the matrices.
+            ValueError: The spacing does not fit the matrices.
 
         >>> from torchkcreg.geometry import circular_geometry
         >>> views = circular_geometry([0.0], sad=400, sdd=600, det_shape=(5, 5), pixel_spacing=(2.0, 1.0))
@@ -58,10 +58,10 @@ class DetectorFrames:
         sources: Sequence[str] | None = None,
         angles_deg: Sequence[float] | None = None,
     ) -> ConeBeamGeometry:
-        """The geometry of detectors of (rows, cols) pixels.
+        """The geometry of these frames with detectors of (rows, cols) pixels.
 
         Raises:
-            ValueError: numbers that are not finite, or pixel steps that differ from view to view.
+            ValueError: Numbers are not finite, or pixel steps differ between views.
         """
         across, down = self.col_steps.double(), self.row_steps.double()
         for name, vectors in vars(self).items():
@@ -87,14 +87,14 @@ class DetectorFrames:
 
 
 def gantry_about_z(axis: str) -> Tensor:
-    """The turn (4, 4) of a world whose gantry turns about an axis into one where it turns about z, handedness kept.
+    """Rotation (4, 4) from a world whose gantry rotates about `axis` to one where it rotates about z.
 
-    RTK's gantry turns about y: its (x, y, z) become (z, x, y), so that the source of gantry angle b is at
-    ``(sad cos b, sad sin b, 0)``, as in `circular_geometry`. Points of the old world are turned by it, and a geometry
-    by ``geometry.moved(gantry_about_z(axis).inverse())``.
+    RTK's gantry rotates about y: (x, y, z) becomes (z, x, y), so that the source at gantry angle b is at
+    `(sad cos b, sad sin b, 0)`, as in `circular_geometry`. Handedness is preserved. Transform points of the old world
+    by this matrix, and a geometry by `geometry.moved(gantry_about_z(axis).inverse())`.
 
     Args:
-        axis: "x", "y" or "z" of the old world.
+        axis: Rotation axis in the old world, "x", "y" or "z".
 
     >>> (gantry_about_z("y")[:3, :3] @ torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)).tolist()
     [3.0, 1.0, 2.0]

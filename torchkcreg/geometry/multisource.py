@@ -1,4 +1,4 @@
-"""The three-source extremity scanner: focal spots one above the other that fire in turn while the gantry turns."""
+"""The three-source extremity scanner: focal spots above each other that fire in turn while the gantry rotates."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ class MultisourceScanner:
     """The extremity CBCT scanner of Cao et al. 2020 (section 2.1), and others built like it.
 
     Attributes:
-        sad: distance from the sources to the axis of rotation, mm.
-        sdd: distance from the sources to the detector, mm.
-        det_shape: pixels (rows, cols).
-        det_size_mm: size (height, width) of all pixels together: 0.388 mm each on the nominal 300 mm panel.
-        source_z_mm: height of each focal spot by name, T1 superior.
-        firing_order: names of the sources in the order in which they fire, over and over.
-        num_views: views in a scan.
-        step_deg: gantry angle from one view to the next.
-        start_deg: gantry angle of the first view.
-        phase_deg: a gantry angle at which the first source of the firing order fires; the paper's set of three views
-            has T1 at 91 degrees.
+        sad: Distance from the sources to the axis of rotation, mm.
+        sdd: Distance from the sources to the detector, mm.
+        det_shape: Number of pixels (rows, cols).
+        det_size_mm: Size (height, width) of the pixel array; 0.388 mm per pixel on the nominal 300 mm panel.
+        source_z_mm: Height of each focal spot by name; T1 is superior.
+        firing_order: Names of the sources in firing order, repeated over the scan.
+        num_views: Number of views in a scan.
+        step_deg: Gantry angle between views.
+        start_deg: Gantry angle of the first view.
+        phase_deg: A gantry angle at which the first source of the firing order fires. In the paper's three-view set T1
+            fires at 91 degrees.
 
     >>> MultisourceScanner().geometry()
     ConeBeamGeometry(num_views=200, det_shape=(768, 768), pixel_spacing=(0.388, 0.388), sources=T1:50/T2:100/T3:50)
@@ -64,12 +64,12 @@ class MultisourceScanner:
         return (round(dv, 12), round(du, 12))
 
     def view_sources(self) -> list[str]:
-        """The source that fires each view."""
+        """Name of the source of each view."""
         lag = round((self.phase_deg - self.start_deg) / self.step_deg)
         return [self.firing_order[(view - lag) % len(self.firing_order)] for view in range(self.num_views)]
 
     def geometry(self) -> ConeBeamGeometry:
-        """Geometry of a whole scan, labelled with angles and sources."""
+        """Geometry of a whole scan with angles and source names."""
         sources = self.view_sources()
         return circular_geometry(
             [self.start_deg + view * self.step_deg for view in range(self.num_views)],
@@ -82,11 +82,11 @@ class MultisourceScanner:
         )
 
     def paper_views(self, name: str) -> list[int]:
-        """Indices of the views that the paper registers to (section 2.4).
+        """Indices of the views used for registration in the paper (section 2.4).
 
         Args:
-            name: ``"12"``: 15, 30, ... 180 degrees, four views a source, the sources taken in turn (the nearest view of
-                that source, at most 2 degrees off); ``"3"``: neighbours at 91 (T1), 92 (T2) and 93 degrees (T3).
+            name: `"12"`: 15, 30, ... 180 degrees with the sources in turn, four views per source (the nearest view of
+                that source, at most 2 degrees off). `"3"`: adjacent views at 91 (T1), 92 (T2) and 93 degrees (T3).
 
         >>> MultisourceScanner().paper_views("3")
         [91, 92, 93]

@@ -1,4 +1,4 @@
-"""Which way views look: a projection matrix and its negative see the same lines, in opposite directions."""
+"""Signs of projection matrices: P and -P define the same rays, in opposite directions."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-_LEAST_ANGLE = 1e-3  # rad between central rays; less, and where they meet is anybody's guess
-_AT_SOURCE = 1e-3  # of the largest depth
-_FURTHEST = 0.5  # of its depth, by which central rays may miss the point where they meet
+_LEAST_ANGLE = 1e-3  # rad between central rays; below it their intersection is undetermined
+_AT_SOURCE = 1e-3  # share of the largest depth; nearer points count as at the source
+_FURTHEST = 0.5  # largest distance of central rays from their meeting point, relative to its distance from the source
 
 
 def checked_shape(det_shape: Sequence[int]) -> tuple[int, int]:
-    """A detector's (rows, cols); ValueError where they are none."""
+    """A detector's (rows, cols) as integers; ValueError if invalid."""
     if len(det_shape) != 2 or any(int(n) != n or n < 1 for n in det_shape):
         raise ValueError(f"det_shape must be two positive integers (rows, cols), got {tuple(det_shape)}")
     return int(det_shape[0]), int(det_shape[1])
 
 
 def checked_matrices(matrices: Tensor) -> Tensor:
-    """Projection matrices (V, 3, 4) in float64 with unit normals in row 2; ValueError where they are none."""
+    """Projection matrices (V, 3, 4) in float64 with unit normals in row 2; ValueError if invalid."""
     given = matrices if isinstance(matrices, Tensor) else torch.as_tensor(matrices, device="cpu")
     matrices = given.double()
     if matrices.ndim != 3 or tuple(matrices.shape[1:]) != (3, 4) or len(matrices) == 0:
@@ -34,11 +34,11 @@ def checked_matrices(matrices: Tensor) -> Tensor:
 
 
 def looking_signs(matrices: Tensor, det_shape: tuple[int, int]) -> tuple[Tensor, bool]:
-    """Signs (V,) that make depths positive in front of the source, and whether the views themselves tell them.
+    """Signs (V,) that make depths positive in front of the source, and True if they follow from the views.
 
-    Views of one object look at it: the lines from the sources through the middles of their detectors pass near a point,
-    which lies in front of all of them. Where they do not (one view, parallel ones, one source that turns), the world's
-    origin is taken to be in front; where that is the source, a matrix keeps its sign.
+    Views of one object point at it: their central rays (through the detector centres) pass near a common point, which
+    is in front of all sources. If there is no such point (one view, parallel views, a source that only rotates in
+    place), the world's origin is taken to be in front. If the origin is at the source, the matrix keeps its sign.
 
     Args:
         matrices: (V, 3, 4), float64, row 2 with a unit normal.
@@ -56,15 +56,15 @@ def looking_signs(matrices: Tensor, det_shape: tuple[int, int]) -> tuple[Tensor,
 
 
 def turned_towards(matrices: Tensor, points: Tensor, *, keep: bool) -> Tensor:
-    """Matrices (V, 3, 4) that have world points (N, 3) in front of their sources.
+    """Matrices (V, 3, 4) with signs such that world points (N, 3) are in front of the sources.
 
     Args:
         matrices: (V, 3, 4), float64, row 2 with a unit normal.
         points: Positions in mm.
-        keep: Signs are known, and stay.
+        keep: True if the signs are known and must not change.
 
     Raises:
-        ValueError: a point lies at or behind a source.
+        ValueError: A point lies at or behind a source.
     """
     points = points.to(matrices)
     if not keep:
@@ -85,7 +85,7 @@ def _depths_of(matrices: Tensor, points: Tensor) -> Tensor:
 
 
 def _meeting_point(matrices: Tensor, det_shape: tuple[int, int]) -> Tensor | None:
-    """The point (3,) with the smallest squared distances from the central rays; None where they hardly cross."""
+    """Least-squares intersection (3,) of the central rays; None if they are near parallel or do not meet."""
     rows, cols = det_shape
     middle = matrices.new_tensor([(cols - 1) / 2, (rows - 1) / 2, 1.0])
     inverse = torch.linalg.inv(matrices[:, :, :3])

@@ -1,4 +1,4 @@
-"""Views of other packages: ASTRA, LEAP and TIGRE, each by its own parameters."""
+"""Conversion of geometries from and to other packages: ASTRA, LEAP and TIGRE."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .frames import DetectorFrames
 
 
 def from_astra(vectors: Tensor, det_shape: Sequence[int]) -> ConeBeamGeometry:
-    """The geometry of ASTRA's `cone_vec`: rows (V, 12) of source, detector centre, column step and row step, in mm.
+    """Geometry from ASTRA's `cone_vec`, rows of source, detector centre, column step and row step in mm.
 
-    ASTRA's lengths are in units of its voxels: bring them to mm first. Its sinograms are (rows, V, cols), so views are
-    ``sinogram.swapaxes(0, 1)``.
+    ASTRA's lengths are in units of its voxels; convert them to mm first. Its sinograms are (rows, V, cols), so images
+    are `sinogram.swapaxes(0, 1)`.
 
     Args:
-        vectors: (V, 12).
-        det_shape: (rows, cols).
+        vectors: ASTRA's vectors, (V, 12).
+        det_shape: Detector size (rows, cols).
     """
     vectors = torch.as_tensor(vectors).double()
     if vectors.dim() != 2 or vectors.shape[1] != 12:
@@ -51,13 +51,13 @@ def from_leap(
     det_shape: Sequence[int],
     pixel_spacing: Sequence[float],
 ) -> ConeBeamGeometry:
-    """The geometry of LEAP's modular beam, all (V, 3) in mm, as `set_modularbeam` takes it.
+    """Geometry from the parameters of LEAP's `set_modularbeam`; all vectors (V, 3) in mm.
 
     Args:
-        source_positions: focal spots.
-        module_centers: middles of the detectors.
-        row_vectors: unit vectors along which the row index grows.
-        col_vectors: unit vectors along which the column index grows.
+        source_positions: Focal spots.
+        module_centers: Centres of the detectors.
+        row_vectors: Unit vectors of increasing row index.
+        col_vectors: Unit vectors of increasing column index.
         det_shape: (numRows, numCols).
         pixel_spacing: (pixelHeight, pixelWidth), mm.
     """
@@ -68,7 +68,7 @@ def from_leap(
 
 
 def to_leap(geometry: ConeBeamGeometry) -> dict[str, Tensor]:
-    """Vectors (V, 3) of LEAP's modular beam: what `from_leap` takes, by its names."""
+    """Vectors (V, 3) of LEAP's modular beam, keyed by the argument names of `from_leap`."""
     frames = DetectorFrames.of(geometry)
     return {
         "source_positions": frames.sources,
@@ -92,22 +92,22 @@ def from_leap_cone(
     tau: float = 0.0,
     tilt_angle: float = 0.0,
 ) -> ConeBeamGeometry:
-    """The geometry of LEAP's cone beam with a flat detector: what `set_conebeam` takes after the number of angles.
+    """Geometry from the parameters of LEAP's `set_conebeam` (flat detector), without the number of angles.
 
-    LEAP's source is at ``sod (sin phi, -cos phi, 0)``; its rows grow with z.
+    LEAP's source is at `sod (sin phi, -cos phi, 0)`; its row index increases with z.
 
     Args:
-        num_rows: of the detector.
-        num_cols: of the detector.
-        pixel_height: mm.
-        pixel_width: mm.
-        center_row: row that the central ray hits.
-        center_col: column that the central ray hits.
-        phis: degrees (V,).
-        sod: source to axis, mm.
-        sdd: source to detector, mm.
-        tau: how far the axis stands beside the central ray, mm.
-        tilt_angle: of the detector about the central ray, degrees.
+        num_rows: Detector rows.
+        num_cols: Detector columns.
+        pixel_height: Row spacing in mm.
+        pixel_width: Column spacing in mm.
+        center_row: Row hit by the central ray.
+        center_col: Column hit by the central ray.
+        phis: Gantry angles (V,) in degrees.
+        sod: Distance from source to axis, mm.
+        sdd: Distance from source to detector, mm.
+        tau: Lateral distance of the rotation axis from the central ray, mm.
+        tilt_angle: Rotation of the detector about the central ray, degrees.
 
     >>> views = from_leap_cone(5, 5, 1.0, 1.0, 2.0, 2.0, [0.0], 400.0, 600.0)
     >>> [round(float(x)) for x in views.source_positions[0]]
@@ -128,19 +128,18 @@ def from_leap_cone(
 
 
 def from_tigre(geo: Any, angles: Sequence[float] | Tensor) -> ConeBeamGeometry:
-    """The geometry of a `tigre.geometry` of mode "cone" and its angles; TIGRE itself is not needed.
+    """Geometry from a `tigre.geometry` of mode "cone" and its angles; TIGRE itself is not needed.
 
-    TIGRE's source is at ``DSO (cos a, sin a, 0)``; its projections (V, rows, cols) are ours. Distances and offsets may
-    be one for all views, or one for each.
+    TIGRE's source is at `DSO (cos a, sin a, 0)`; its projections (V, rows, cols) can be used as they are. Distances
+    and offsets are one for all views or one per view.
 
     Args:
-        geo: anything with TIGRE's attributes: DSD, DSO, nDetector (V, U), dDetector (V, U), and optionally offOrigin
+        geo: Object with TIGRE's attributes: DSD, DSO, nDetector (V, U), dDetector (V, U), and optionally offOrigin
             (Z, Y, X), offDetector (V, U) and COR, all in mm.
-        angles: radians (V,).
+        angles: Gantry angles (V,) in radians.
 
     Raises:
-        ValueError: another mode than "cone", or a detector that is turned in itself (`rotDetector`): give its vectors
-            to `DetectorFrames`.
+        ValueError: The mode is not "cone", or the detector is rotated (`rotDetector`): use `DetectorFrames` for that.
 
     >>> from types import SimpleNamespace
     >>> geo = SimpleNamespace(mode="cone", DSD=600, DSO=400, nDetector=(5, 5), dDetector=(2.0, 1.0))
@@ -152,14 +151,14 @@ def from_tigre(geo: Any, angles: Sequence[float] | Tensor) -> ConeBeamGeometry:
         raise ValueError(f"geometry must be of mode cone, got {geo.mode}")
     radians = torch.as_tensor(angles).double()
     if radians.dim() != 1:
-        raise ValueError(f"angles must have shape (V,), one turn about z a view, got {tuple(radians.shape)}")
+        raise ValueError(f"angles must have shape (V,), one rotation about z per view, got {tuple(radians.shape)}")
 
     def each(name: str, size: int) -> Tensor:
         value = torch.as_tensor(getattr(geo, name, 0.0)).double()
         return value.reshape(-1, size if value.numel() >= size else 1).expand(len(radians), size)
 
     if bool(each("rotDetector", 3).any()):
-        raise ValueError("a detector that is turned in itself (rotDetector) is given by its vectors: DetectorFrames")
+        raise ValueError("a rotated detector (rotDetector) is not supported: give its vectors to DetectorFrames")
     along, across, up = gantry_axes(radians)
     dso, dsd, axis = each("DSO", 1), each("DSD", 1), each("COR", 1)
     shift_v, shift_u = each("offDetector", 2).split(1, dim=1)

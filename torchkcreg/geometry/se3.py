@@ -1,7 +1,7 @@
-"""Rigid motions as 4 x 4 matrices: rotation vectors, their inverse, and the weighted least-squares fit (Kabsch).
+"""Rigid motions as 4 x 4 matrices: rotation vectors, inverses, weighted least-squares fit (Kabsch), principal axes.
 
-Points are rows, ``(..., N, 3)``, and a matrix acts as ``x -> R x + t``. Everything is batched over leading dimensions
-and differentiable, also at the identity, where the textbook formulas divide zero by zero.
+Points are rows, `(..., N, 3)`, and a matrix acts as `x -> R x + t`. The rigid motions are batched over leading
+dimensions and differentiable, also at the identity, where the textbook formulas divide zero by zero.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_SMALL_ANGLE_SQUARED = 1e-3  # below it, Taylor series: their first dropped term is under 1e-16
+_SMALL_ANGLE_SQUARED = 1e-3  # below it Taylor series are used, with a truncation error under 1e-16
 
 
 def principal_axes(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (3,) of points (N, 3), and unit vectors (3, 3), one a row, from the least variance to the largest.
+    """Mean (3,) of points (N, 3) and their principal axes (3, 3), one per row, from least to largest variance.
 
-    Signs are as they come: an axis may point either way.
+    The signs of the axes are arbitrary.
     """
     center = points.mean(0)
     return center, torch.linalg.eigh((points - center).mT @ (points - center)).eigenvectors.mT
@@ -28,7 +28,7 @@ def _check_last(name: str, tensor: Tensor, *sizes: int) -> None:
 
 
 def _skew(vector: Tensor) -> Tensor:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``_skew(a) @ b = a x b``."""
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): `_skew(a) @ b = a x b`."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
@@ -37,8 +37,8 @@ def _skew(vector: Tensor) -> Tensor:
 def rotation_from_vector(rotation_vector: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3): axis times angle in radians.
 
-    Rodrigues' formula ``R = I + a K + b K^2`` with ``a = sin(t)/t``, ``b = (1 - cos t)/t^2`` and ``K`` the
-    cross-product matrix; values and derivatives are right at zero too.
+    Rodrigues' formula `R = I + a K + b K^2` with `a = sin(t)/t`, `b = (1 - cos t)/t^2` and `K` the
+    cross-product matrix. Values and derivatives are also right at zero.
 
     >>> quarter_turn_about_z = rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2]))
     >>> (quarter_turn_about_z @ torch.tensor([1.0, 0.0, 0.0])).round().abs().tolist()
@@ -57,10 +57,11 @@ def rotation_from_vector(rotation_vector: Tensor) -> Tensor:
 
 
 def vector_from_rotation(rotation: Tensor) -> Tensor:
-    """Rotation vectors (..., 3), at most pi long, of rotation matrices (..., 3, 3); inverts `rotation_from_vector`.
+    """Rotation vectors (..., 3) of length at most pi of rotation matrices (..., 3, 3).
 
-    Goes through the unit quaternion: ``4 q q^T`` is linear in the matrix, and its row with the largest diagonal element
-    is ``q`` up to a factor, which loses no digits anywhere, half turns included (their sign is arbitrary).
+    Inverse of `rotation_from_vector`. Computed by the unit quaternion q: `4 q q^T` is linear in the matrix, and its row
+    with the largest diagonal element is `q` up to a factor. This is accurate everywhere, including half turns (whose
+    sign is arbitrary).
 
     >>> vector_from_rotation(rotation_from_vector(torch.tensor([0.125, -0.25, 0.5]))).round(decimals=4).tolist()
     [0.125, -0.25, 0.5]
@@ -80,7 +81,7 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     squared = (axis * axis).sum(-1, keepdim=True)
     small = squared < _SMALL_ANGLE_SQUARED
     sine = torch.where(small, torch.ones_like(squared), squared).sqrt()
-    ratio = squared / (cosine * cosine).clamp_min(0.5)  # tan^2 of half the angle where it is small; not used elsewhere
+    ratio = squared / (cosine * cosine).clamp_min(0.5)  # tan^2 of half the angle; used for small angles only
     series = (1 - ratio * (1 / 3 - ratio * (1 / 5 - ratio * (1 / 7 - ratio / 9)))) / cosine.clamp_min(0.5)
     return axis * 2 * torch.where(small, series, torch.atan2(sine, cosine) / sine)
 
@@ -105,7 +106,7 @@ def _assemble(rotation: Tensor, translation: Tensor) -> Tensor:
 
 
 def rotation_about(center: Tensor, rotation_vector: Tensor) -> Tensor:
-    """Rigid transforms (..., 4, 4) that turn by rotation vectors (..., 3) about centres (..., 3).
+    """Rigid transforms (..., 4, 4) that rotate by rotation vectors (..., 3) about centres (..., 3).
 
     >>> half_turn = rotation_about(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, torch.pi]))
     >>> transform_points(half_turn, torch.zeros(1, 3)).round().abs().tolist()
@@ -116,19 +117,19 @@ def rotation_about(center: Tensor, rotation_vector: Tensor) -> Tensor:
 
 
 def across(axis: Tensor) -> Tensor:
-    """Two unit vectors (2, 3) that make a right-handed frame with a unit vector (3,), which comes last.
+    """Two unit vectors (2, 3) that with a unit vector (3,) as the third form a right-handed frame.
 
     >>> across(torch.tensor([0.0, 0.0, 1.0])).abs().tolist()
     [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     """
-    other = torch.eye(3, dtype=axis.dtype, device=axis.device)[int(axis.abs().argmin())]
-    first = torch.linalg.cross(axis, other)
+    coordinate_axis = torch.eye(3, dtype=axis.dtype, device=axis.device)[int(axis.abs().argmin())]
+    first = torch.linalg.cross(axis, coordinate_axis)
     first = first / first.norm()
     return torch.stack([first, torch.linalg.cross(axis, first)])
 
 
 def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
-    """Points (..., N, 3) moved by affine transforms (..., 4, 4), leading dimensions broadcast; in the points' dtype.
+    """Points (..., N, 3) moved by affine transforms (..., 4, 4), in the points' dtype; leading dimensions broadcast.
 
     >>> transform_points(rigid_matrix(torch.zeros(3), torch.ones(3)), torch.zeros(2, 3)).tolist()
     [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
@@ -143,27 +144,27 @@ def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
 
 
 def invert_rigid(matrix: Tensor) -> Tensor:
-    """Inverses (..., 4, 4) of rigid transforms: ``R^T`` and ``-R^T t``. Not for matrices that scale or shear."""
+    """Inverses (..., 4, 4) of rigid transforms: `R^T` and `-R^T t`. Not for matrices that scale or shear."""
     _check_last("matrix", matrix, 4, 4)
     inverse = matrix[..., :3, :3].mT
     return _assemble(inverse, -(inverse @ matrix[..., :3, 3:]).squeeze(-1))
 
 
 def fit_rigid(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Rigid transforms (..., 4, 4) that minimise ``sum_n w_n |R s_n + t - t_n|^2``; proper rotations, batched.
+    """Rigid transforms (..., 4, 4) that minimise `sum_n w_n |R s_n + t - t_n|^2`; proper rotations, batched.
 
-    Kabsch's solution (1976), computed in double precision. Where the points leave a rotation undetermined (all on a
-    line, or all in one place) the smallest rotation is taken, so that a group of two points or one has a motion, too.
-    The derivative is that of the optimum itself, through its first-order condition, and not through the singular value
-    decomposition, which has none where singular values meet.
+    Kabsch's solution (1976), computed in double precision. Where the points do not determine the rotation (all on a
+    line, or all in one place) the smallest rotation is taken, so groups of one or two points also have a motion. The
+    derivative follows from the first-order condition of the optimum, not from the singular value decomposition, which
+    is not differentiable where singular values coincide.
 
     Args:
-        source: points (..., N, 3) in mm.
-        target: where they went, (..., N, 3); leading dimensions broadcast.
-        weights: (..., N), not negative, with a positive sum; all one if not given.
+        source: Points (..., N, 3) in mm.
+        target: Positions of the same points after the motion, (..., N, 3); leading dimensions broadcast.
+        weights: Weights (..., N), not negative, with a positive sum; by default all one.
 
     Raises:
-        ValueError: shapes don't fit, or weights are negative or sum to zero.
+        ValueError: Shapes do not fit, or weights are negative or sum to zero.
 
     >>> moved = fit_rigid(torch.eye(3), torch.eye(3) + 2.0)
     >>> moved[:3, 3].round(decimals=4).tolist()
@@ -200,12 +201,13 @@ def _shares(weights: Tensor | None, points: Tensor) -> Tensor:
 
 
 def _closest_rotation(covariance: Tensor, noise: Tensor) -> Tensor:
-    """Proper rotations (..., 3, 3) that maximise ``trace(R^T A)``, with the derivative of the maximiser.
+    """Proper rotations (..., 3, 3) that maximise `trace(R^T A)`, differentiable in A.
 
-    Singular values below ``noise`` (rounding of the coordinates, mm) times the spread of the points count as zero.
+    Singular values below `noise` (rounding of the coordinates, mm) times the spread of the points are treated as zero.
 
-    ``S = R^T A`` is symmetric at the maximum. Differentiating that gives ``dR = R W`` with the skew ``W`` that solves
-    ``W S + S W = B - B^T``, ``B = R^T dA``: in the eigenvectors of S a division by sums of eigenvalues.
+    `S = R^T A` is symmetric at the maximum. Differentiating that gives `dR = R W` with the skew `W` that solves
+    `W S + S W = B - B^T`, where `B = R^T dA`. In the basis of the eigenvectors of S this is a division by sums of
+    eigenvalues.
     """
     u, sigma, vh = torch.linalg.svd(covariance.detach())
     sign = torch.linalg.det(u @ vh)

@@ -1,4 +1,4 @@
-"""`VolumeGrid`: where the voxels of a volume lie in the world."""
+"""`VolumeGrid`: world positions of the voxels of a volume, and distances on it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class VolumeGrid:
-    """Voxel lattice of a volume of shape (D, H, W), indexed z, y, x; lengths and positions are in x, y, z order.
+    """Voxel grid of a volume of shape (D, H, W), indexed z, y, x; lengths and positions are in x, y, z order.
 
-    Voxel index (i, j, k), i along x, is at ``origin + direction @ ((i, j, k) * spacing)`` and holds
-    ``volume[k, j, i]``: the conventions of ITK.
+    Voxel index (i, j, k), i along x, is at `origin + direction @ ((i, j, k) * spacing)` and holds
+    `volume[k, j, i]`: the conventions of ITK.
 
     Attributes:
-        shape: (D, H, W).
-        spacing: (x, y, z) in mm, positive; one number for all three.
-        origin: world position (x, y, z) in mm of the centre of voxel (0, 0, 0).
-        direction: 3 x 3, columns are the unit vectors of the x, y and z index.
+        shape: Number of voxels (D, H, W).
+        spacing: Voxel spacing (x, y, z) in mm, positive; one number is used for all three.
+        origin: World position (x, y, z) in mm of the centre of voxel (0, 0, 0).
+        direction: 3 x 3 matrix whose columns are the unit vectors of the x, y and z index.
 
     Raises:
-        ValueError: counts or lengths that are not positive, or a direction that is not orthonormal.
+        ValueError: Counts or lengths are not positive, or the direction is not orthonormal.
 
     >>> grid = VolumeGrid.centered((4, 4, 8), spacing=0.5)
     >>> grid.origin
@@ -65,7 +65,7 @@ class VolumeGrid:
         center: Sequence[float] = (0.0, 0.0, 0.0),
         direction: Sequence[Sequence[float]] = _IDENTITY,
     ) -> VolumeGrid:
-        """Grid whose middle is at a world position ``center`` (x, y, z) in mm."""
+        """Grid centred at the world position `center` (x, y, z) in mm."""
         steps = torch.tensor(_three("spacing", spacing), dtype=torch.float64)
         counts = torch.tensor([float(n) for n in shape], dtype=torch.float64).flip(0)
         axes = torch.as_tensor(direction, dtype=torch.float64)
@@ -103,7 +103,7 @@ class VolumeGrid:
         return torch.linalg.inv(self.voxel_to_world)
 
     def lies_on(self, other: VolumeGrid) -> bool:
-        """Whether its voxels are where another grid's are, to a thousandth of a voxel."""
+        """True if voxel positions agree with another grid's to a thousandth of a voxel."""
         return torch.allclose(self.voxel_to_world, other.voxel_to_world, atol=1e-3 * min(other.spacing))
 
     def points(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
@@ -124,11 +124,11 @@ def _three(name: str, values: float | Sequence[float]) -> tuple[float, float, fl
 
 
 def distance_to(filled: Tensor, grid: VolumeGrid) -> Tensor:
-    """Distances (D, H, W) in mm of voxel centres from the nearest voxel that is filled; infinite where none is.
+    """Distances (D, H, W) in mm of voxel centres from the nearest filled voxel; infinite if there is none.
 
     Args:
-        filled: (D, H, W), true or above zero where the thing is.
-        grid: the voxels.
+        filled: True or above zero inside the object, (D, H, W).
+        grid: Grid of the voxels.
     """
     if not bool((filled > 0).any()):
         return torch.full(grid.shape, torch.inf)

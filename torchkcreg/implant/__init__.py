@@ -1,4 +1,4 @@
-"""Known components: an implant as a point cloud of nodes, volumes and cells, from a mesh or from a volume; screws."""
+"""Implants as point clouds (nodes, volumes, lattice cells) from a mesh or a volume; holes, screws, voxelization."""
 
 from .closed_mesh import closed_mesh, closed_triangles, deformed_surface, volume
 from .components import Component

@@ -1,4 +1,7 @@
-"""Meshes checked and made ready for volume integrals: closed, consistently wound, outside counter-clockwise."""
+"""Checks and repairs meshes for volume integrals: closed, wound consistently, counter-clockwise seen from outside.
+
+Also the volume of a closed mesh, and the surface of a deformed one.
+"""
 
 from __future__ import annotations
 
@@ -14,24 +17,24 @@ from torch import Tensor
 
 _FARTHEST_MM = 1e7
 _ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
-_MOST_BODIES = 1000  # that are looked at one by one
+_MOST_BODIES = 1000  # limit for the inside-out bodies, which are tested one by one
 
 
 def deformed_surface(
     warp: Callable[[Tensor], Tensor], mesh: trimesh.Trimesh, *, longest_edge_mm: float = 4.0
 ) -> trimesh.Trimesh:
-    """The surface of a mesh where a mapping of points takes it.
+    """The surface of a mesh after a mapping of its points.
 
-    Long edges are split first: those of a flat side may run from end to end of a plate and could not bend. Chords of
-    4 mm stay within 2 micrometres of a plate that bends by 3 degrees over 5 cm.
+    Long edges are split first, because those of a flat side may span the whole plate and could not follow its bending.
+    Chords of 4 mm stay within 2 micrometres of a plate that bends by 3 degrees over 5 cm.
 
     Args:
-        warp: Maps points (N, 3) of the mesh's frame, mm, float64.
-        mesh: The surface at rest.
-        longest_edge_mm: Edges are split until none is longer.
+        warp: Mapping of points (N, 3) in the mesh's frame, mm, float64.
+        mesh: The undeformed surface.
+        longest_edge_mm: Edges are split until none is longer than this.
 
     Raises:
-        ValueError: the length is not positive.
+        ValueError: If the length is not positive.
     """
     if not longest_edge_mm > 0:
         raise ValueError(f"longest_edge_mm must be positive, got {longest_edge_mm}")
@@ -46,14 +49,14 @@ def closed_triangles(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def closed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A closed mesh whose faces are wound counter-clockwise seen from outside; the mesh passed in stays as it is.
+    """Copy of a closed mesh with all faces wound counter-clockwise seen from outside.
 
-    Vertices at the same place are merged first, since STL files repeat them, and faces that are there twice are taken
-    once. Inverted meshes are turned inside out, mixed winding is repaired; of several bodies each that is inside out is
-    turned, unless it lies in another one: then it is a cavity.
+    Coincident vertices are merged first, since STL files repeat them, and duplicate faces are removed. Inverted meshes
+    are turned inside out, and mixed winding is repaired. With several bodies, each one that is inside out is turned,
+    unless it lies inside another body: then it is a cavity.
 
     Raises:
-        ValueError: the mesh has open edges (their number is given), no volume, or a surface that has no two sides.
+        ValueError: If the mesh has open edges (their number is given), no volume, or a one-sided surface.
     """
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"mesh must be a trimesh.Trimesh with faces, got {mesh!r}")
@@ -84,12 +87,13 @@ def closed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _merged(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
-    """A mesh whose vertices at the same place are one."""
+    """Mesh with coincident vertices merged."""
     bits = (vertices + 0.0).view(np.uint64)  # no -0.0
     bits ^= bits >> np.uint64(31)  # the last bits of what was single precision are all zero
     hashed = bits[:, 0] * _ODD[0] + bits[:, 1] * _ODD[1] + bits[:, 2] * _ODD[2]
     _, first, index = np.unique(hashed, return_index=True, return_inverse=True)
-    if np.array_equal(vertices[first][index], vertices):  # quick, and nearly always right: fewer are left to compare
+    # the hash is wrong only on a collision; where it is right, fewer vertices are left to compare below
+    if np.array_equal(vertices[first][index], vertices):
         vertices, faces = vertices[first], index[faces]
     merged = trimesh.Trimesh(vertices.copy(), faces.copy(), process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)
@@ -97,44 +101,44 @@ def _merged(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.
 
 
 def _distinct(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Faces without slivers that the merging closed up, and without repetitions of the same winding."""
+    """Faces without those that merging made degenerate, and without duplicates of the same winding."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     first = faces.argmin(1)[:, None]
     rolled = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)  # begins with its smallest vertex
     order = np.lexsort(rolled.T)
-    again = np.zeros(len(faces), bool)
-    again[order[1:]] = (rolled[order[1:]] == rolled[order[:-1]]).all(1)
-    return faces[~again]
+    duplicate = np.zeros(len(faces), bool)
+    duplicate[order[1:]] = (rolled[order[1:]] == rolled[order[:-1]]).all(1)
+    return faces[~duplicate]
 
 
 def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """A number for each edge of each face, the same for both ways along it, and whether it is walked upwards."""
+    """Key of each edge of each face, the same in both directions; True if it runs to a higher vertex index."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     return low * (int(faces.max()) + 1) + high, start < end
 
 
 def _two_sided(faces: NDArray[np.int64]) -> bool:
-    """Whether each edge is walked as often one way as the other."""
+    """True if each edge is traversed equally often in both directions."""
     keys, upwards = _edges(faces)
     return bool(np.array_equal(np.sort(keys[upwards]), np.sort(keys[~upwards])))
 
 
 def volume(mesh: trimesh.Trimesh) -> float:
-    """What a closed mesh encloses, mm^3."""
+    """Volume that a closed mesh encloses, mm^3."""
     return float(_tetrahedra(np.asarray(mesh.vertices)[np.asarray(mesh.faces)]).sum())
 
 
 def _tetrahedra(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Volumes (m,) between the triangles and their common middle, those seen from inside negative."""
+    """Volumes (m,) of the tetrahedra from the triangles to their common centre, negative where seen from inside."""
     a, b, c = (triangles - triangles.mean((0, 1))).transpose(1, 2, 0)
     cross = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
     return sum(x * y for x, y in zip(a, cross)) / 6
 
 
 def _turned_outwards(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Faces whose bodies hold a positive volume, but for cavities."""
+    """Faces wound so that each body has a positive volume; cavities stay negative."""
     volumes = _tetrahedra(vertices[faces])
     links = coo_array((np.ones(2 * len(faces)), (faces[:, [0, 1]].T.ravel(), faces[:, [1, 2]].T.ravel())))
     links.resize(len(vertices), len(vertices))
@@ -157,7 +161,7 @@ def _turned_outwards(vertices: NDArray[np.float64], faces: NDArray[np.int64]) ->
 
 
 def _within(vertices: NDArray[np.float64], index: int, faces: NDArray[np.int64]) -> bool:
-    """Whether a vertex lies inside a closed surface: whether the surface is seen all around it."""
+    """True if a vertex lies inside a closed surface, by the solid angle of the surface seen from it."""
     corners = vertices[faces] - vertices[index]
     a, b, c = np.moveaxis(corners / np.linalg.norm(corners, axis=-1, keepdims=True), 1, 0)
     triple = np.einsum("ni,ni->n", a, np.cross(b, c))

@@ -15,15 +15,15 @@ class Component(nn.Module):
     """A rigid part that is fixed to an implant near one of its ends, like a screw near its head.
 
     Args:
-        name: how results refer to it.
-        cloud: its nodes, in the implant's frame.
-        material: name of its material.
-        head: (3,) point in the implant's frame, in mm, whose surroundings it moves with.
+        name: Its name in results.
+        cloud: Its nodes, in the implant's frame.
+        material: Name of its material.
+        head: (3,) point in the implant's frame, mm. The component moves with the implant around this point.
         axis: (3,) direction from the head to the tip, of any length.
-        screw: the screw that it is, if it is one.
+        screw: Description of the screw, if the component is one.
 
     Raises:
-        ValueError: shapes that do not fit, or an axis of no length.
+        ValueError: If shapes do not fit or the axis is zero.
 
     >>> screw = Component.screw("s1", (0, 0, 0), (0, 20, 0), radius=1.75, pitch=0.5)
     >>> screw.axis.tolist(), round(screw.cloud.volume, 2)
@@ -56,7 +56,7 @@ class Component(nn.Module):
 
     @classmethod
     def of(cls, screw: Screw, *, pitch: float = 0.25, dtype: torch.dtype = torch.float32) -> Component:
-        """A screw as a cylinder of solid material from the centre of its head to its tip."""
+        """Component of a screw: a solid cylinder from the centre of its head to its tip."""
         start, end = (torch.tensor(point, dtype=dtype, device="cpu") for point in (screw.start, screw.end))
         return cls(screw.name, screw.cloud(pitch, dtype=dtype), screw.material, start, end - start, screw=screw)
 
@@ -72,7 +72,7 @@ class Component(nn.Module):
         pitch: float = 0.25,
         dtype: torch.dtype = torch.float32,
     ) -> Component:
-        """The component of the screw between two points in mm, see :class:`Screw`."""
+        """Component of the screw between two points, mm; see `Screw`."""
         return cls.of(Screw(_point(head), _point(tip), radius, material, name), pitch=pitch, dtype=dtype)
 
 

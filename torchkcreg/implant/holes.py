@@ -1,4 +1,4 @@
-"""Round holes of an implant, where its screws sit, found in its mesh."""
+"""Finds the round screw holes of an implant in its mesh."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 _STEEPEST_TURN = np.deg2rad(50.0)  # between neighbouring faces of a hole's wall
-_FLAT = np.deg2rad(3.0)  # in a bent implant the triangles of a wall's facet are no longer in one plane
-_ALONG_AXIS = 0.35  # a wall's normals are at right angles to its axis, but for countersinks
-_RIM = 1.6  # radii from the axis within which a countersink ends
-_OPENING = np.deg2rad(170.0)  # a wall surrounds its screw by more than half: combination holes open into each other
+_FLAT = np.deg2rad(3.0)  # in a bent implant the triangles of one wall facet are not exactly coplanar
+_ALONG_AXIS = 0.35  # bound on the axial component of a wall's normals; those of countersinks have more
+_RIM = 1.6  # in radii: distance from the axis within which a countersink ends
+_OPENING = np.deg2rad(170.0)  # largest gap of a wall around its axis: holes of a combination hole are open to a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +23,9 @@ class Hole:
 
     Attributes:
         center: Middle of its axis, (3,), in the mesh's frame, mm.
-        axis: Direction of its axis, (3,), a unit vector; which of the two ways has no meaning.
-        radius: Of its wall where it is narrowest, mm.
-        depth: Length of its axis from surface to surface of the implant about it, countersinks included, mm.
+        axis: Unit vector (3,) along its axis; the sign has no meaning.
+        radius: Radius where the hole is narrowest, mm.
+        depth: Length along its axis between the implant's surfaces, countersinks included, mm.
     """
 
     center: np.ndarray
@@ -35,11 +35,11 @@ class Hole:
 
 
 def find_holes(mesh: trimesh.Trimesh, *, smallest_mm: float = 0.75, largest_mm: float = 5.0) -> list[Hole]:
-    """Round holes whose radius lies between two bounds, in mm, in the order of their position along the implant.
+    """Round holes with a radius between two bounds, mm, ordered by their position along the implant.
 
-    A hole's wall is a patch of faces that meet at edges bent inwards; the normals of a round one lie in a plane, at
-    right angles to the axis, face every direction, and meet on the axis. Countersinks and threads only add faces that
-    look along it. A combination hole counts as the two round ones that it is made of.
+    The wall of a hole is a patch of faces that meet at concave edges. The normals of a round wall are perpendicular to
+    the axis, point in all directions around it, and meet on it. Countersinks and threads only add faces whose normals
+    are inclined to the axis. A combination hole counts as its two round holes.
 
     Example:
         >>> plate = trimesh.creation.annulus(r_min=2.0, r_max=8.0, height=4.0)
@@ -48,27 +48,27 @@ def find_holes(mesh: trimesh.Trimesh, *, smallest_mm: float = 0.75, largest_mm: 
     """
     merged = trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)
-    turn = merged.face_adjacency_angles
-    inwards = ~merged.face_adjacency_convex & (turn > 1e-6) & (turn < _STEEPEST_TURN)
-    flat = turn < _FLAT
+    angles = merged.face_adjacency_angles
+    inwards = ~merged.face_adjacency_convex & (angles > 1e-6) & (angles < _STEEPEST_TURN)
+    flat = angles < _FLAT
     curved = np.zeros(len(merged.faces), bool)
     curved[merged.face_adjacency[inwards]] = True
-    # the triangles of one flat facet of a wall belong together
+    # joins the triangles of one flat facet of a wall
     within = flat & curved[merged.face_adjacency].any(axis=1)
     faces = _Faces(merged.triangles, merged.face_normals, merged.area_faces)
     holes = [
         _hole_of(faces.of(patch)) for patch in _patches(merged.face_adjacency[inwards | within], len(merged.faces))
     ]
-    found: list[Hole] = []
+    joined_holes: list[Hole] = []
     for hole in holes:
         if hole is not None and smallest_mm <= hole.radius <= largest_mm:
-            found = _joined(found, hole)
+            joined_holes = _joined(joined_holes, hole)
     spread = np.linalg.svd(merged.vertices - merged.vertices.mean(axis=0), full_matrices=False)[2][0]
-    return sorted((_to_the_surfaces(h, merged.vertices) for h in found), key=lambda h: float(h.center @ spread))
+    return sorted((_to_the_surfaces(h, merged.vertices) for h in joined_holes), key=lambda h: float(h.center @ spread))
 
 
 def _to_the_surfaces(hole: Hole, vertices: np.ndarray) -> Hole:
-    """The hole with its axis from surface to surface: one with a countersink or a step begins above its wall."""
+    """The hole extended from surface to surface: with a countersink or a step it begins above its wall."""
     spokes = vertices - hole.center
     along = spokes @ hole.axis
     aside = np.linalg.norm(spokes - np.outer(along, hole.axis), axis=1)
@@ -85,12 +85,12 @@ class _Faces(NamedTuple):
     areas: np.ndarray
 
     def of(self, index: np.ndarray) -> _Faces:
-        """Some of them."""
+        """The faces with the given indices."""
         return _Faces(self.triangles[index], self.normals[index], self.areas[index])
 
 
 def _patches(pairs: np.ndarray, count: int) -> list[np.ndarray]:
-    """Indices of the faces of each patch that pairs (m, 2) of neighbours make of ``count`` faces."""
+    """Face indices of each connected patch, from pairs (m, 2) of neighbours among `count` faces."""
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     labels = connected_components(links, directed=False)[1]
     linked = np.unique(pairs)
@@ -99,7 +99,7 @@ def _patches(pairs: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def _hole_of(patch: _Faces) -> Hole | None:
-    """The hole whose wall is a patch of faces; None if the patch is no wall."""
+    """The hole whose wall is a patch of faces; None if the patch is not the wall of a round hole."""
     normals, areas = patch.normals, patch.areas
     axis = np.linalg.eigh((normals * areas[:, None]).T @ normals)[1][:, 0]
     wall = np.abs(normals @ axis) < _ALONG_AXIS
@@ -109,7 +109,7 @@ def _hole_of(patch: _Faces) -> Hole | None:
     centers, corners = triangles.mean(1), triangles.reshape(-1, 3)
     across = normals - np.outer(normals @ axis, axis)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    # the point whose distances to the walls' planes spread least: p.n - c.n = -radius
+    # least squares for the point p with equal distances to the planes of the wall's faces: p.n - c.n = -radius
     system = np.column_stack([across, np.ones(len(across))]) * np.sqrt(areas)[:, None]
     system = np.vstack([system, np.append(axis, 0.0) * np.sqrt(areas.sum())])
     middle = np.median(corners @ axis)
@@ -126,7 +126,7 @@ def _hole_of(patch: _Faces) -> Hole | None:
 
 
 def _joined(holes: list[Hole], new: Hole) -> list[Hole]:
-    """Holes with a new one; rings of one wall, apart where a thread or a seam parts them, become one."""
+    """Holes with a new one added; rings of the same wall, separated by a thread or a seam, are joined."""
     for index, old in enumerate(holes):
         way = new.center - old.center
         along = float(way @ old.axis)

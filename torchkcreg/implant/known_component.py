@@ -1,4 +1,4 @@
-"""A piece of metal in its place in the world: what a reconstruction is told of an implant."""
+"""Metal objects at known positions in the world, as used by a known-component reconstruction."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .voxelize import voxelize_mesh, voxelize_points
 
 @dataclass(frozen=True)
 class KnownComponent:
-    """A piece of metal in its place in the world: bent plate, screw.
+    """A metal object (bent plate, screw) at its position in the world.
 
     Attributes:
-        cloud: fine nodes with partial volumes, in world mm.
-        material: name of its material.
-        mesh: its surface in world mm, where there is one: makes the mask exact.
+        cloud: Fine nodes with partial volumes, in world coordinates, mm.
+        material: Name of its material.
+        mesh: Its surface in world coordinates, mm, if available; makes the mask exact.
     """
 
     cloud: ImplantPointCloud
@@ -29,7 +29,7 @@ class KnownComponent:
 
     @classmethod
     def from_mesh(cls, mesh: trimesh.Trimesh, material: str, *, pitch: float = 0.25) -> KnownComponent:
-        """From a closed surface in world mm.
+        """Component from a closed surface in world coordinates, mm.
 
         >>> ball = KnownComponent.from_mesh(trimesh.creation.icosphere(2, 3.0), "steel", pitch=0.5)
         >>> ball.material, ball.mesh.is_watertight
@@ -38,7 +38,7 @@ class KnownComponent:
         return cls(ImplantPointCloud.from_mesh(mesh, pitch), material, mesh)
 
     def fraction(self, grid: VolumeGrid) -> Tensor:
-        """Share of each voxel that it fills, (D, H, W)."""
+        """Fraction of each voxel that it fills, (D, H, W)."""
         if self.mesh is not None:
             return voxelize_mesh(self.mesh, grid)
         return voxelize_points(self.cloud.points, self.cloud.volumes, grid, cell=self.cloud.cell).clamp(0, 1)

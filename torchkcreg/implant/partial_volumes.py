@@ -1,9 +1,9 @@
-"""How much of each cell of a lattice a closed triangle mesh fills, exactly, by clipping its triangles to the cells.
+"""Exact fraction of each lattice cell inside a closed triangle mesh, by clipping the triangles to the cells.
 
-The divergence theorem turns the volume inside a cell into a sum over the surface: a piece of triangle in cell k of a
-column bounds the material below it, that is part of its own cell and all of the cells under that one. So each triangle
-is cut at the faces of the cells, the pieces are integrated in closed form, and a running sum down each column fills the
-inside. There is no sampling, no ray that could hit an edge, and the sum over all cells is the volume of the mesh.
+The divergence theorem turns the volume inside a cell into a sum over the surface. A piece of triangle in cell k of a
+column bounds the material below it: part of cell k and all cells under it. Each triangle is cut at the faces of the
+cells, the pieces are integrated in closed form, and a running sum down each column fills the interior. There is no
+sampling and no ray that could hit an edge, and the sum over all cells is the volume of the mesh.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-_EMPTY = 1e-9  # a cell with less than this fraction inside is rounding error
+_EMPTY = 1e-9  # a smaller fraction is a rounding error
 _CHUNK = 20_000  # polygons clipped at a time, to bound memory
 
 
 class FilledCells(NamedTuple):
-    """Cells that a mesh fills in part or whole.
+    """Cells that a mesh fills partly or wholly.
 
     Attributes:
         indices: (n, 3), cell i spans [i, i + 1] along each axis.
         fractions: (n,), between 0 and 1 up to rounding, unless the mesh overlaps itself.
-        centroids: (n, 3), of the part inside, between 0 and 1 within the cell.
+        centroids: (n, 3), centroid of the part inside, in cell coordinates from 0 to 1.
     """
 
     indices: Integers
@@ -45,10 +45,10 @@ def fill_cells(triangles: Floats) -> FilledCells:
     """
     triangles = np.asarray(triangles, dtype=np.float64)
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    # surfaces parallel to the columns bound nothing from above or below: run the columns along as many as possible
+    # triangles parallel to the columns need no integration: choose the direction with the most of them
     needed = (np.linalg.norm(normals, axis=1)[:, None] * (normals != 0)).sum(0)
     axis = int(np.argmin(needed))
-    order = [(axis + 1) % 3, (axis + 2) % 3, axis]  # cyclic, so that outside stays outside
+    order = [(axis + 1) % 3, (axis + 2) % 3, axis]  # cyclic, so that the winding stays the same
     polygons = triangles[normals[:, axis] != 0][:, :, order]
     cells, sums = _merge(*_pieces(polygons))
     indices, fractions, moments = _run_down_columns(cells, sums)
@@ -61,9 +61,9 @@ def fill_cells(triangles: Floats) -> FilledCells:
 
 
 def _pieces(polygons: Floats) -> tuple[Integers, Floats]:
-    """Cells (n, 3) and integrals (n, 7) of the pieces into which the cells cut the triangles."""
+    """Cells (n, 3) and integrals (n, 7) of the triangle pieces within single cells."""
     cells, sums = [np.zeros((0, 3), np.int64)], [np.zeros((0, 7))]
-    # large triangles make many pieces, so strips along one axis are the unit of work
+    # a large triangle makes many pieces, so the chunks are made of strips along one axis
     strips, counts = _cut(polygons, np.full(len(polygons), 3), axis=0)
     for start in range(0, len(strips), _CHUNK):
         part = strips[start : start + _CHUNK], counts[start : start + _CHUNK]
@@ -76,7 +76,7 @@ def _pieces(polygons: Floats) -> tuple[Integers, Floats]:
 
 
 def _cut(polygons: Floats, counts: Integers, axis: int) -> tuple[Floats, Integers]:
-    """Convex polygons (n, K, 3) of ``counts`` vertices cut at integer coordinates along an axis.
+    """Cut convex polygons (n, K, 3) of `counts` vertices at integer coordinates along an axis.
 
     Unused vertices repeat the first one, here and everywhere below.
     """
@@ -88,12 +88,12 @@ def _cut(polygons: Floats, counts: Integers, axis: int) -> tuple[Floats, Integer
     first = np.cumsum(slabs[~whole]) - slabs[~whole]
     slab = low[parent] + np.arange(len(parent)) - np.repeat(first, slabs[~whole])
     cut, cut_counts = _clip(polygons[parent], counts[parent], axis, slab, 1.0)
-    kept = cut_counts > 0
-    cut, cut_counts = _clip(cut[kept], cut_counts[kept], axis, slab[kept] + 1, -1.0)
-    kept = cut_counts > 2
+    nonempty = cut_counts > 0
+    cut, cut_counts = _clip(cut[nonempty], cut_counts[nonempty], axis, slab[nonempty] + 1, -1.0)
+    nonempty = cut_counts > 2
     wide = max(polygons.shape[1], cut.shape[1])
-    joined = np.concatenate([_widen(polygons[whole], wide), _widen(cut[kept], wide)])
-    return joined, np.concatenate([counts[whole], cut_counts[kept]])
+    joined = np.concatenate([_widen(polygons[whole], wide), _widen(cut[nonempty], wide)])
+    return joined, np.concatenate([counts[whole], cut_counts[nonempty]])
 
 
 def _widen(polygons: Floats, width: int) -> Floats:
@@ -103,38 +103,36 @@ def _widen(polygons: Floats, width: int) -> Floats:
 
 
 def _clip(polygons: Floats, counts: Integers, axis: int, bound: Integers, sign: float) -> tuple[Floats, Integers]:
-    """Polygons clipped to ``sign * (x - bound) >= 0`` along an axis (Sutherland and Hodgman 1974)."""
+    """Polygons clipped to `sign * (x - bound) >= 0` along an axis (Sutherland and Hodgman 1974)."""
     if len(polygons) == 0:
         return polygons, counts
     used = np.arange(polygons.shape[1]) < counts[:, None]
     above = sign * (polygons[:, :, axis] - bound[:, None])
-    above_next = np.roll(
-        above, -1, axis=1
-    )  # the vertex after the last one is the first: either repeated or by wrapping
+    above_next = np.roll(above, -1, axis=1)  # the last vertex is followed by the first, repeated or by wrapping
     inside = above >= 0
     crosses = (inside != (above_next >= 0)) & used
     step = np.divide(above, above - above_next, out=np.zeros_like(above), where=crosses)
     crossing = polygons + step[:, :, None] * (np.roll(polygons, -1, axis=1) - polygons)
     crossing[:, :, axis] = bound[:, None]
-    kept = np.stack([inside & used, crosses], axis=2).reshape(len(polygons), -1)
+    used_slots = np.stack([inside & used, crosses], axis=2).reshape(len(polygons), -1)
     candidates = np.stack([polygons, crossing], axis=2).reshape(len(polygons), -1, 3)
-    counts = kept.sum(1)
-    row, column = np.nonzero(kept)
-    slot = np.cumsum(kept, axis=1)[row, column] - 1
-    first = candidates[np.arange(len(polygons)), kept.argmax(1)]
+    counts = used_slots.sum(1)
+    row, column = np.nonzero(used_slots)
+    slot = np.cumsum(used_slots, axis=1)[row, column] - 1
+    first = candidates[np.arange(len(polygons)), used_slots.argmax(1)]
     clipped = np.repeat(first[:, None], max(int(counts.max()), 1), axis=1)
     clipped[row, slot] = candidates[row, column]
     return clipped, counts
 
 
 def _integrate(polygons: Floats) -> tuple[Integers, Floats]:
-    """Cells (n, 3) that hold the polygons, and integrals (n, 7) over their shadows on the floor of the cell.
+    """Cells (n, 3) that contain the polygons, and integrals (n, 7) over their projections on the floor of the cell.
 
-    With x, y, z counted from the cell's corner: 1, x, y (of the full cells below), then z, x z, y z, z^2/2 (of the part
-    of this cell below the polygon). The signed area of the shadow makes what faces down count negative.
+    With x, y, z relative to the cell's corner, the integrands are 1, x, y (for the full cells below), then z, x z, y z,
+    z^2/2 (for the part of this cell below the polygon). Projected areas are signed: downward faces count negative.
     """
     lowest = polygons.min(1)
-    middle = (lowest + polygons.max(1)) / 2  # inside the cell; corners may lie on a face and belong to either cell
+    middle = (lowest + polygons.max(1)) / 2  # inside the cell, whereas corners may lie on a face between two cells
     cells = np.where(lowest == polygons.max(1), np.floor(lowest), np.floor(middle)).astype(np.int64)
     x, y, z = np.moveaxis(polygons - cells[:, None], -1, 0)
     # a fan of triangles around the first vertex: (n, K - 2)
@@ -154,7 +152,7 @@ def _integrate(polygons: Floats) -> tuple[Integers, Floats]:
 
 
 def _merge(cells: Integers, sums: Floats) -> tuple[Integers, Floats]:
-    """Distinct cells in order (columns, then upwards) and the sums over their pieces."""
+    """Distinct cells, ordered by column and then upwards, and the sums over their pieces."""
     if len(cells) == 0:
         return cells, sums
     low = cells.min(0)
@@ -169,8 +167,8 @@ def _merge(cells: Integers, sums: Floats) -> tuple[Integers, Floats]:
 
 
 def _run_down_columns(cells: Integers, sums: Floats) -> tuple[Integers, Floats, Floats]:
-    """Indices, fractions and first moments of all cells, those between pieces of surface included."""
-    # the sum over a column of a closed surface is zero, so that one running sum from the end serves all columns
+    """Indices, fractions and first moments of all cells, including full cells between pieces of surface."""
+    # over each column the sum of a closed surface is zero, so one running sum from the end serves all columns
     above = np.cumsum(sums[::-1, :3], axis=0)[::-1] - sums[:, :3]
     fractions = sums[:, 3] + above[:, 0]
     moments = sums[:, 4:] + above[:, [1, 2, 0]] * [1.0, 1.0, 0.5]

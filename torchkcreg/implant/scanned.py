@@ -1,4 +1,4 @@
-"""An implant's surface out of a volume: a bench scan of it, as in Cao et al. 2020 (section 2.4)."""
+"""Surface of an implant from a bench scan (CT volume), as in Cao et al. 2020 (section 2.4)."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from torchkcreg.geometry import VolumeGrid
 
 _SAMPLE = 2_000_000  # values, enough for a histogram
 _BINS = 512
-_DIM = 6.0  # deviations of the noise by which metal is brighter than what is around it, at least
-_SMALL = 0.01  # of the implant's volume: a body smaller than that is noise
+_DIM = 6.0  # least contrast of metal to surroundings, in standard deviations of the noise
+_SMALL = 0.01  # of the implant's volume: smaller bodies are noise
 _SMOOTHINGS = 10
 
 
 def scanned_surface(volume: Tensor, grid: VolumeGrid) -> trimesh.Trimesh:
-    """The closed surface of the implant in a volume, where values are half of the metal's, in the volume's world, mm.
+    """Closed surface of the implant in a volume at half the metal's value, in world coordinates, mm.
 
-    The metal's value is that of its outer layers, so that a scan whose middle is too dark (beam hardening) has the
-    right size. Cavities and small bodies are artefacts and left out; of several large bodies the largest is taken, with
-    a warning. The surface is smoothed without shrinking (Taubin 1995), less than a tenth of a voxel.
+    The metal's value is taken from its outer layers, so that beam hardening (a centre that is too dark) does not change
+    the size. Cavities and small bodies are treated as artefacts and left out. Of several large bodies the largest is
+    used, with a warning. The surface is smoothed without shrinking (Taubin 1995), by less than a tenth of a voxel.
 
     Args:
         volume: (D, H, W), attenuation or any unit that is linear in it.
-        grid: Where its voxels are.
+        grid: Voxel grid of the volume.
 
     Raises:
-        ValueError: If nothing in the volume stands out, or scikit-image is not installed.
+        ValueError: If no metal stands out in the volume, or scikit-image is not installed.
     """
     try:
         from skimage.measure import marching_cubes
@@ -54,7 +54,7 @@ def scanned_surface(volume: Tensor, grid: VolumeGrid) -> trimesh.Trimesh:
 
 
 def _levels(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Values of what is around the implant, and of its metal."""
+    """Values of the surroundings of the implant, and of its metal."""
     step = max(1, values.size // _SAMPLE)
     counts, edges = np.histogram(values.ravel()[::step], _BINS)
     middles = (edges[1:] + edges[:-1]) / 2

@@ -1,4 +1,4 @@
-"""A screw as far as its shadow goes: a cylinder in the implant's frame."""
+"""Screws, modelled as solid cylinders in the implant's frame: enough for their X-ray shadow."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from torchkcreg.geometry import across, rotation_about, transform_points
 from .point_cloud import ImplantPointCloud
 
 Point = tuple[float, float, float]
-_COMMON_LENGTH_MM, _COMMON_RADIUS_MM = 24.0, 2.0  # about those of most screws
+_COMMON_LENGTH_MM, _COMMON_RADIUS_MM = 24.0, 2.0  # about the dimensions of most screws
 
 
 def cylinder_mesh(
     start: Sequence[float], end: Sequence[float], radius: float, *, sections: int = 64
 ) -> trimesh.Trimesh:
-    """Closed mesh of a straight cylinder between two points in mm, a prism of exactly the cylinder's volume.
+    """Closed mesh of a straight cylinder between two points, mm: a prism of exactly the cylinder's volume.
 
     Raises:
-        ValueError: the points coincide, or radius is not positive.
+        ValueError: If the points coincide or the radius is not positive.
 
     >>> round(float(cylinder_mesh((0, 0, 0), (0, 0, 10), 2.0).volume / (10 * 4 * math.pi)), 9)
     1.0
@@ -66,11 +66,11 @@ class Screw:
     """A cylinder in the implant's frame, mm.
 
     Attributes:
-        start: Centre (x, y, z) of its head's end, in the hole's opening.
-        end: Its tip.
-        radius: Of its shaft.
-        material: Name of its material.
-        name: How results refer to it.
+        start: Centre (x, y, z) of the head end, in the opening of the hole.
+        end: Tip (x, y, z).
+        radius: Radius of the shaft.
+        material: Name of the material.
+        name: Name of the screw in results.
 
     Raises:
         ValueError: If start and end coincide, are not three finite numbers each, or the radius is not positive.
@@ -97,50 +97,50 @@ class Screw:
 
     @property
     def length(self) -> float:
-        """From start to end, mm."""
+        """Length from start to end, mm."""
         return float(np.linalg.norm(np.subtract(self.end, self.start)))
 
     def with_length(self, length: float) -> Screw:
-        """The screw with its tip elsewhere along its axis."""
+        """Copy with another length, mm; the start stays."""
         axis = np.subtract(self.end, self.start) / self.length
         return replace(self, end=tuple(np.add(self.start, length * axis)))
 
     def with_radius(self, radius: float) -> Screw:
-        """The screw, thicker or thinner."""
+        """Copy with another radius, mm."""
         return replace(self, radius=radius)
 
     def same_side(self, other: Screw) -> bool:
-        """Whether two screws point the same way."""
+        """True if two screws point the same way."""
         return float(np.subtract(self.end, self.start) @ np.subtract(other.end, other.start)) > 0
 
     def overlaps(self, other: Screw) -> bool:
-        """Whether two screws share a hole or, side by side in a combination hole, run into each other."""
+        """True if two screws overlap: in the same hole, or side by side in a combination hole."""
         way = np.subtract(self.start, other.start)
         axis = np.subtract(other.end, other.start) / other.length
         return float(np.linalg.norm(way - (way @ axis) * axis)) < self.radius + other.radius
 
     def moved(self, rotation: Tensor, shift: Tensor) -> Screw:
-        """The screw, turned about its start by a rotation vector (3,) and then shifted by a vector (3,), mm."""
+        """Copy rotated about its start by a rotation vector (3,) and then shifted by a vector (3,), mm."""
         ends = torch.tensor([self.start, self.end], dtype=torch.float64, device="cpu")
         turned = transform_points(rotation_about(ends[0], rotation.cpu().double()), ends) + shift.cpu().double()
         return replace(self, start=tuple(turned[0].tolist()), end=tuple(turned[1].tolist()))
 
     def moved_by(self, motion: Tensor) -> Screw:
-        """The screw after a rigid motion (4, 4)."""
+        """Copy after a rigid motion (4, 4)."""
         ends = torch.tensor([self.start, self.end], dtype=torch.float64, device="cpu")
         start, end = transform_points(motion.detach().cpu().double(), ends).tolist()
         return replace(self, start=tuple(start), end=tuple(end))
 
     def mesh(self) -> trimesh.Trimesh:
-        """Its surface, a prism of exactly its volume."""
+        """Surface of the screw, a prism of exactly its volume."""
         return cylinder_mesh(self.start, self.end, self.radius)
 
     def cloud(self, pitch: float = 0.25, *, dtype: torch.dtype = torch.float32) -> ImplantPointCloud:
-        """Its nodes, ``pitch`` mm apart."""
+        """Point cloud of the screw, with nodes `pitch` mm apart."""
         return cylinder_cloud(self.start, self.end, self.radius, pitch, dtype=dtype)
 
     def stretched_cloud(self, pitch: float) -> ImplantPointCloud:
-        """Its nodes, those of a common screw stretched: in no time, but on a lattice of its own."""
+        """Point cloud of the screw, stretched from that of a standard screw: fast, but on a stretched lattice."""
         common = _common_cloud(pitch)
         start, end = (torch.tensor(p, dtype=torch.float64, device="cpu") for p in (self.start, self.end))
         axis = (end - start) / (end - start).norm()
@@ -149,7 +149,7 @@ class Screw:
         return common.mapped(stretch, start)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types under the names of the fields, for files."""
+        """The fields as plain types, for files."""
         return {
             "start": list(self.start),
             "end": list(self.end),

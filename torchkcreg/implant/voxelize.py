@@ -1,4 +1,4 @@
-"""Implants on voxel grids: the fraction of each voxel that is metal, from a mesh (exact) or from a cloud of nodes."""
+"""Implants on voxel grids: metal fraction of each voxel, from a mesh (exact) or from a point cloud."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .partial_volumes import fill_cells
 
 
 def voxelize_mesh(mesh: trimesh.Trimesh, grid: VolumeGrid, *, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Fraction of each voxel inside a closed mesh, (D, H, W); exact, partial volumes included.
+    """Fraction of each voxel inside a closed mesh, (D, H, W); exact, including partial volumes.
 
     Args:
-        mesh: closed surface in world mm.
-        grid: the voxels; what lies outside is left out.
-        dtype: of the result.
+        mesh: Closed surface in world coordinates, mm.
+        grid: Voxel grid; parts of the mesh outside it are ignored.
+        dtype: Dtype of the result.
 
     Raises:
-        ValueError: the mesh is open or encloses nothing.
+        ValueError: If the mesh is open or encloses no volume.
 
     >>> box = trimesh.creation.box((1.0, 2.0, 2.5))
     >>> voxelize_mesh(box, VolumeGrid.centered((5, 4, 3), 1.0))[:, 1, 1].tolist()
@@ -46,13 +46,13 @@ def voxelize_points(points: Tensor, volumes: Tensor, grid: VolumeGrid, *, cell: 
     """Fraction of each voxel that the nodes of a cloud fill, (D, H, W); differentiable in points and volumes.
 
     Each node is cut into parts no larger than a voxel, and each part is shared among the eight voxels around it with
-    trilinear weights. So the total volume and its centroid are kept, but edges blur by about a voxel.
+    trilinear weights. Total volume and centroid are preserved, but edges blur by about a voxel.
 
     Args:
-        points: (N, 3) in world mm, wherever a deformation took them.
+        points: (N, 3) in world coordinates, mm, after any deformation.
         volumes: (N,) in mm^3.
-        grid: the voxels; what falls outside is lost.
-        cell: (3, 3) edges of the nodes' cells in rows, in world mm; points without extent if not given.
+        grid: Voxel grid; volume outside it is lost.
+        cell: (3, 3) edges of the nodes' cells in rows, in world coordinates, mm; nodes are points if not given.
 
     >>> half = voxelize_points(torch.zeros(1, 3), torch.ones(1), VolumeGrid.centered((1, 1, 2), 1.0))
     >>> half.tolist()
@@ -75,7 +75,7 @@ def voxelize_points(points: Tensor, volumes: Tensor, grid: VolumeGrid, *, cell: 
 
 
 def _deposit(voxels: Tensor, shares: Tensor, grid: VolumeGrid) -> Tensor:
-    """Shares (N,) at voxel coordinates (N, 3) laid down with trilinear weights, (D H W,)."""
+    """Sum of shares (N,) at voxel coordinates (N, 3), distributed with trilinear weights, (D H W,)."""
     depth, height, width = grid.shape
     size = torch.tensor([width, height, depth], device=voxels.device)
     low = voxels.detach().floor()

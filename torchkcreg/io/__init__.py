@@ -1,7 +1,7 @@
-"""Files in and out: geometry, projections, meshes, spectra, points, poses, configurations, runs and figures.
+"""Reading and writing files: geometry, projections, meshes, spectra, points, poses, configurations, runs, figures.
 
-Only this folder touches a disk. What it reads is checked, and an error is one line that names the file and the key;
-what it writes is there whole or not at all.
+Only this package accesses the disk. Input is validated, and an error message is one line that names the file and the
+key. Files are written atomically: a file is either complete or absent.
 """
 
 from .config import read_config, write_config

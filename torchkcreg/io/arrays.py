@@ -1,4 +1,4 @@
-"""Large arrays beside a JSON file: the file names them, an NPZ holds them."""
+"""Large arrays of a JSON file, stored in an NPZ file; single NPY arrays; check of checkpoint content."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MOST_IN_JSON = 4096
 
 
 def without_arrays(content: Any, where: str = "") -> tuple[Any, dict[str, Tensor]]:
-    """The content with ``{"array": name}`` in place of every tensor of more than 4096 numbers, and these by name."""
+    """The content with `{"array": name}` for each tensor of more than 4096 numbers, and these tensors by name."""
     if isinstance(content, Tensor):
         return ({_KEY: where}, {where: content}) if content.numel() > _MOST_IN_JSON else (content, {})
     pairs: Any = {}
@@ -27,18 +27,18 @@ def without_arrays(content: Any, where: str = "") -> tuple[Any, dict[str, Tensor
     else:
         return content, {}
     parts = {key: without_arrays(value, f"{where}.{key}" if where else str(key)) for key, value in pairs}
-    arrays = {name: array for _, found in parts.values() for name, array in found.items()}
+    arrays = {name: array for _, nested in parts.values() for name, array in nested.items()}
     if isinstance(content, dict):
         return {key: part for key, (part, _) in parts.items()}, arrays
     return [part for part, _ in parts.values()], arrays
 
 
 def with_arrays(content: Any, path: Path) -> Any:
-    """The content with its arrays out of an NPZ file.
+    """The content with its array references replaced by the arrays of an NPZ file.
 
     Raises:
-        FileNotFoundError: The file is needed and not there.
-        ValueError: It lacks an array, or is damaged.
+        FileNotFoundError: The content refers to an array, but the file does not exist.
+        ValueError: The file lacks an array or is damaged.
     """
     if not isinstance(content, (dict, list)):
         return content
@@ -50,7 +50,7 @@ def with_arrays(content: Any, path: Path) -> Any:
 
 
 def write_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
-    """Nothing; writes an NPZ file, whole or not at all."""
+    """Write an NPZ file atomically."""
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **{name: array.detach().cpu().numpy() for name, array in arrays.items()})  # type: ignore[arg-type]
 
@@ -61,14 +61,22 @@ def read_array(path: Path) -> Tensor:
 
 
 def write_array(path: Path, array: Tensor) -> None:
-    """Write an array as an NPY file, whose folder is made where it is missing."""
+    """Write an array as an NPY file. The folder is created if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         np.save(temporary, array.numpy())
 
 
 def require_loadable(content: Any, where: str) -> None:
-    """Nothing; ValueError where content of a checkpoint, at a place in it, is more than tensors and plain data."""
+    """Check that a checkpoint holds only tensors and plain data.
+
+    Args:
+        content: The checkpoint or a part of it.
+        where: Path of the part, for the error message.
+
+    Raises:
+        ValueError: It holds something else.
+    """
     if content is None or isinstance(content, (bool, int, float, str)) or type(content) is torch.Tensor:
         return
     if isinstance(content, dict):
@@ -89,5 +97,5 @@ def _array(path: Path, name: str) -> Tensor:
             return torch.from_numpy(stored[name])
     except KeyError:
         raise ValueError(f"arrays file {path} has no array {name!r}") from None
-    except Exception as error:  # numpy's, zipfile's and zlib's own
+    except Exception as error:  # numpy, zipfile and zlib raise various types
         raise ValueError(f"arrays file {path} cannot be read: {error}") from error

@@ -1,4 +1,4 @@
-"""Configurations: one YAML or JSON file describes a run."""
+"""Configuration files (YAML or JSON) that describe a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .files import read_text, write_text
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML that refuses a key given twice, where plain YAML would silently take the last."""
+    """Safe YAML loader that rejects duplicate keys (plain YAML silently takes the last)."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -26,20 +26,21 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-# YAML 1.1 takes 1e-4 (no point) for a text.
+# YAML 1.1 reads 1e-4 (no decimal point) as a string.
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )
 
 
 def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The mapping in a YAML or JSON file (JSON is YAML); an empty file is an empty mapping.
+    """The mapping in a YAML or JSON file (JSON is YAML). An empty file gives an empty mapping.
 
-    Values are plain data: nothing in the file is executed. What the keys mean is validated by whoever takes them.
+    Values are plain data: nothing in the file is executed. Keys and values are validated by the caller.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no YAML, no mapping, has a key twice or a key that is no text; the message names the line.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is not valid YAML, is no mapping, or has a duplicate or non-string key. Syntax errors and
+            duplicate keys are reported with their line.
     """
     text = read_text(path, "configuration")
     try:
@@ -56,7 +57,7 @@ def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def write_config(path: str | os.PathLike[str], config: dict[str, Any]) -> None:
-    """Nothing; writes a mapping of plain data as YAML, in its own order."""
+    """Write a mapping of plain data as YAML, keeping the order of its keys."""
     write_text(path, yaml.safe_dump(plain(config), sort_keys=False, allow_unicode=True, width=120))
 
 

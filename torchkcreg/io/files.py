@@ -1,4 +1,4 @@
-"""Reading with errors that name the file, and writing that never leaves half a file."""
+"""Text, JSON and figure files: reading with errors that name the file, atomic writing; size of the memory."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def existing_file(path: str | os.PathLike[str], what: str) -> Path:
     """The path of an existing regular file.
 
     Args:
-        path: where it should be.
-        what: what the file is, for the error message ("geometry", "mesh", ...).
+        path: Path of the file.
+        what: Kind of file, for the error message ("geometry", "mesh", ...).
 
     Raises:
-        FileNotFoundError: nothing is there.
-        ValueError: it is a folder or something else that is not a file.
+        FileNotFoundError: The path does not exist.
+        ValueError: The path is a folder or another thing that is not a regular file.
     """
     path = Path(path)
     if not path.exists():
@@ -39,15 +39,15 @@ def existing_file(path: str | os.PathLike[str], what: str) -> Path:
 
 
 def existing_place(path: str | os.PathLike[str], what: str) -> Path:
-    """The path of an existing file or folder; raises as `existing_file`."""
+    """The path of an existing file or folder. Raises the same errors as `existing_file`."""
     return Path(path) if Path(path).is_dir() else existing_file(path, what)
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well, and vanishes when it fails.
+    """A temporary path beside `path`: renamed to `path` when the block succeeds, deleted when it fails.
 
-    The temporary name ends like the final one, since many writers choose their format by it.
+    The temporary name keeps the suffix, since many writers choose the format by it.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -70,7 +70,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def physical_memory() -> float:
-    """Bytes of memory that the machine has; infinite where the system does not say."""
+    """Physical memory of the machine in bytes; infinite if the system does not report it."""
     names = getattr(os, "sysconf_names", {})
     if not {"SC_PHYS_PAGES", "SC_PAGE_SIZE"} <= set(names):
         return math.inf
@@ -78,13 +78,13 @@ def physical_memory() -> float:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Nothing; writes a UTF-8 text file, whole or not at all."""
+    """Write a UTF-8 text file atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def append_line(path: str | os.PathLike[str], line: str) -> None:
-    """Append a line to a text file, which is made with its folder where it is missing."""
+    """Append a line to a text file. The file and its folder are created if missing."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
@@ -92,7 +92,14 @@ def append_line(path: str | os.PathLike[str], line: str) -> None:
 
 
 def read_text(path: str | os.PathLike[str], what: str) -> str:
-    """The text of a file in UTF-8, or in UTF-16 that says so; ValueError names a file that is something else."""
+    """The text of a UTF-8 file, or of a UTF-16 file with a byte order mark.
+
+    Line ends are converted to newlines.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: It is not a text file.
+    """
     path = existing_file(path, what)
     content = path.read_bytes()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -104,7 +111,12 @@ def read_text(path: str | os.PathLike[str], what: str) -> str:
 
 
 def read_json(path: str | os.PathLike[str], what: str) -> Any:
-    """The content of a JSON file; ValueError names a file that is no JSON and the line where it breaks."""
+    """The content of a JSON file.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: It is not valid JSON; the message names the file and the line.
+    """
     text = read_text(path, what)
     try:
         return json.loads(text)
@@ -113,11 +125,11 @@ def read_json(path: str | os.PathLike[str], what: str) -> Any:
 
 
 def write_json(path: str | os.PathLike[str], content: Any, *, indent: int | None = 1) -> None:
-    """Nothing; writes `content` as strict JSON, whole or not at all (see `plain` for what it may hold)."""
+    """Write `content` as strict JSON, atomically. See `plain` for the supported types."""
     write_text(path, json.dumps(plain(content), indent=indent, allow_nan=False) + "\n")
 
 
 def write_figure(path: str | os.PathLike[str], figure: Figure, *, dpi: int = 150) -> None:
-    """Nothing; writes a matplotlib figure, whole or not at all, its format chosen by the suffix (.png, .pdf, .svg)."""
+    """Write a matplotlib figure atomically, in the format of the suffix (.png, .pdf, .svg)."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=dpi)

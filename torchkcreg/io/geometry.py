@@ -1,4 +1,4 @@
-"""Projection geometry in files: one 3x4 matrix a view, the matrix being the truth about it."""
+"""Projection geometry files (JSON, RTK, DICOM, tables). The 3x4 matrix of each view defines the geometry."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ def read_geometry(
     pixel_spacing: Sequence[float] | None = None,
     layout: str | None = None,
 ) -> ConeBeamGeometry:
-    """The cone-beam geometry of a file: JSON, RTK's XML, DICOM, or a table of matrices.
+    """Read a cone-beam geometry from JSON, RTK XML, DICOM, or a table of matrices.
 
     JSON has the keys `rows`, `cols`, `pixel_pitch_mm` (a number, or `[dv, du]`), `views`, a list of dicts with
     `projection_matrix` (3x4, world mm to homogeneous 0-based pixels), and optionally `angle_deg` and `source` (a label)
-    in every view. What else a file says about itself is checked against the matrices: `source_mm` or `source_z_mm` of a
-    view within 0.1 mm, and where pixel pitch and matrices put the detector against `sdd_mm` within 1 %. Other keys are
-    ignored.
+    in every view. Redundant keys are checked against the matrices: `source_mm` or `source_z_mm` of a view must agree
+    within 0.1 mm, and `sdd_mm` must agree within 1 % with the source-detector distance that follows from pixel pitch
+    and matrices. Other keys are ignored.
 
-    DICOM files of C-arms, or a folder of them, say what they meant to do: see `read_dicom_geometry`. The other formats
-    (`.xml`, see `read_rtk`; `.npy`, `.npz`, `.csv`, `.txt`, see `read_matrix_table`) do not say what
-    the pixels are: the header of the projections' image does, or the arguments.
+    DICOM files of C-arms, or a folder of them, hold the nominal geometry: see `read_dicom_geometry`. The other formats
+    (`.xml`, see `read_rtk`; `.npy`, `.npz`, `.csv`, `.txt`, see `read_matrix_table`) do not define the pixels. For
+    these, pixels are taken from the arguments or from the header of the projection images.
 
     Args:
-        path: the file.
-        projections: the file of the projections, whose header has pixels and origin (MHA, NRRD, ...).
-        det_shape: (rows, cols), where neither file says them.
-        pixel_spacing: (dv, du) in mm, where neither file says them.
-        layout: of twelve numbers a view in a table.
+        path: The file or DICOM folder.
+        projections: Projection image file (MHA, NRRD, ...) whose header defines pixels and origin.
+        det_shape: (rows, cols), needed if neither file defines them.
+        pixel_spacing: (dv, du) in mm, needed if neither file defines them.
+        layout: Meaning of twelve numbers per view in a table, "matrices" or "astra".
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is malformed, contradicts itself, or nothing says what the pixels are; the message names the
-            file, the view and the key.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is malformed or inconsistent, or the pixels are not defined. The message names the file,
+            the view and the key.
     """
     file = existing_place(path, "geometry")
     suffix = file.suffix.lower()
@@ -86,7 +86,11 @@ def read_geometry(
 
 
 def geometry_from_dict(content: Any) -> ConeBeamGeometry:
-    """The cone-beam geometry described by a dict with the keys of `read_geometry`; ValueError names a bad one."""
+    """The cone-beam geometry described by a dict with the keys of `read_geometry`.
+
+    Raises:
+        ValueError: A key is missing, malformed or inconsistent; the message names it.
+    """
     if not isinstance(content, dict) or not isinstance(content.get("views"), list) or not content["views"]:
         raise ValueError("must be a JSON object with a list 'views' of at least one view")
     views = content["views"]
@@ -110,11 +114,11 @@ def geometry_from_dict(content: Any) -> ConeBeamGeometry:
 
 
 def write_geometry(path: str | os.PathLike[str], geometry: ConeBeamGeometry, *, layout: str = "matrices") -> None:
-    """Writes a geometry as `read_geometry` reads it back, to the same numbers: JSON, RTK's XML, or a table.
+    """Write a geometry as JSON, RTK XML, or a table. `read_geometry` reads back the same numbers.
 
-    Besides what is needed, JSON says for people `source_mm` and `source_z_mm` of each view, and `sad_mm` (distance of
-    the source from the z axis) and `sdd_mm` where all the views agree on them. Tables hold matrices, or ASTRA's vectors
-    where `layout` is "astra".
+    For human readers, JSON also holds `source_mm` and `source_z_mm` of each view, and, if they are equal in all views,
+    `sad_mm` (distance of the source from the z axis) and `sdd_mm`. Tables hold matrices, or ASTRA's vectors if `layout`
+    is "astra".
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".xml":
@@ -126,7 +130,7 @@ def write_geometry(path: str | os.PathLike[str], geometry: ConeBeamGeometry, *, 
 
 
 def geometry_to_dict(geometry: ConeBeamGeometry) -> dict[str, Any]:
-    """A geometry as plain data, with the keys that `read_geometry` knows."""
+    """The geometry as plain data, with the keys of `read_geometry`."""
     sources_mm = geometry.source_positions.detach().cpu().double()
     dv, du = (float(step) for step in geometry.pixel_spacing)
     content: dict[str, Any] = {
@@ -179,7 +183,7 @@ def _pixel_spacing(pitch: Any) -> tuple[float, float]:
 
 
 def _in_every_view(views: list[dict[str, Any]], key: str) -> list[Any] | None:
-    """The key's value in each view, None where no view has it."""
+    """The key's value in each view; None if no view has it."""
     missing = [i for i, view in enumerate(views) if view.get(key) is None]
     if len(missing) == len(views):
         return None
@@ -191,8 +195,8 @@ def _in_every_view(views: list[dict[str, Any]], key: str) -> list[Any] | None:
 def _check_sources(geometry: ConeBeamGeometry, views: list[dict[str, Any]]) -> None:
     for i, (view, derived) in enumerate(zip(views, geometry.source_positions.double())):
         if view.get("source_mm") is not None:
-            said = finite_array(view["source_mm"], (3,), f"source_mm of view {i}")
-            distance = float((said - derived).norm())
+            stated = finite_array(view["source_mm"], (3,), f"source_mm of view {i}")
+            distance = float((stated - derived).norm())
             if distance > SOURCE_TOLERANCE_MM:
                 raise ValueError(
                     f"source_mm of view {i} is {distance:.3g} mm from the source of its projection_matrix, "

@@ -1,4 +1,4 @@
-"""The initial pose of an implant as JSON: a rigid 4x4 `implant_to_world` matrix."""
+"""JSON files of an implant: its initial pose (rigid 4x4 `implant_to_world` matrix) and its screws (cylinders)."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ ROUNDING = 2e-3
 
 
 def read_components(path: str | os.PathLike[str]) -> list[Screw]:
-    """The cylinders of a JSON file `{"units": "mm", "screws": [{"from", "to", "radius", "material", "name"}, ...]}`.
+    """Read screws (cylinders) from a JSON file.
 
-    `from` is the head's end and `to` the tip, x, y, z in the implant's frame in mm; `material` may stand once for all
-    beside `screws`; `name` defaults to screw0, screw1, ...; other keys are ignored.
+    The file holds `{"units": "mm", "screws": [{"from", "to", "radius", "material", "name"}, ...]}`. `from` is the head
+    end and `to` the tip, each x, y, z in mm in the implant's frame. A `material` beside `screws` is the default for all
+    of them. `name` defaults to screw0, screw1, ... Other keys are ignored.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: units other than mm, a missing key, an endless or thickless cylinder, two of one name; the message
-            names the file, the screw and the key.
+        FileNotFoundError: The file does not exist.
+        ValueError: Units other than mm, a missing key, a cylinder of zero length or non-positive radius, or a duplicate
+            name. The message names the file, the screw and the key.
     """
     content = read_json(path, "components")
     try:
@@ -36,15 +37,15 @@ def read_components(path: str | os.PathLike[str]) -> list[Screw]:
             raise ValueError(f"units must be mm, got {content['units']!r}")
         screws = [_screw(screw, i, content.get("material")) for i, screw in enumerate(content["screws"])]
         names = [screw.name for screw in screws]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"names must be unique, {twice[0]!r} is there {names.count(twice[0])} times")
+        if duplicates := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"names must be unique, {duplicates[0]!r} is there {names.count(duplicates[0])} times")
     except ValueError as error:
         raise ValueError(f"components file {path}: {error}") from error
     return screws
 
 
 def write_components(path: str | os.PathLike[str], screws: Sequence[Screw]) -> None:
-    """Nothing; writes cylinders as `read_components` reads them."""
+    """Write screws as a JSON file for `read_components`."""
     listed = [
         {"name": s.name, "from": list(s.start), "to": list(s.end), "radius": s.radius, "material": s.material}
         for s in screws
@@ -79,12 +80,12 @@ def _triple(values: list[float]) -> tuple[float, float, float]:
 def read_init(path: str | os.PathLike[str]) -> Tensor:
     """The rigid transform (4, 4) float64 from the implant's frame to the world, mm.
 
-    The file holds `{"implant_to_world": [[...] x 4]}`, or the four rows alone. Rows with a few decimals make a rotation
-    that is one only nearly: the nearest proper rotation takes its place, about the same translation.
+    The file holds `{"implant_to_world": [[...] x 4]}`, or the four rows alone. Rounded entries are only nearly a
+    rotation, so the nearest rotation is used. The translation is unchanged.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the matrix is missing, scales, shears, mirrors, or projects.
+        FileNotFoundError: The file does not exist.
+        ValueError: The matrix is missing, or it scales, shears, mirrors or projects.
     """
     content = read_json(path, "initial pose")
     if isinstance(content, dict):
@@ -98,20 +99,20 @@ def read_init(path: str | os.PathLike[str]) -> Tensor:
 
 
 def write_init(path: str | os.PathLike[str], implant_to_world: Tensor) -> None:
-    """Nothing; writes a pose as `read_init` reads it."""
+    """Write an initial pose as a JSON file for `read_init`."""
     write_json(path, {"implant_to_world": rigid(implant_to_world.detach().cpu().double(), "implant_to_world")})
 
 
 def rigid(matrix: Tensor, name: str, *, tolerance: float = ROUNDING) -> Tensor:
-    """The exactly rigid matrix (4, 4) nearest to one that is rigid up to rounding.
+    """The rigid matrix (4, 4) nearest to a matrix that is rigid up to rounding.
 
     Args:
         matrix: (4, 4) float64.
-        name: for messages.
-        tolerance: largest element of R^T R - I that counts as rounding.
+        name: Name of the matrix, for messages.
+        tolerance: Largest element of R^T R - I that counts as rounding.
 
     Raises:
-        ValueError: more than rounding is wrong with it, and what.
+        ValueError: The matrix is not rigid within the tolerance; the message says why.
 
     >>> rigid(torch.eye(4).double() * 1.0001, "pose")[:3, :3].tolist()
     Traceback (most recent call last):

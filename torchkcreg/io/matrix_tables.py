@@ -1,4 +1,4 @@
-"""Projection matrices as plain tables: NPY, NPZ, CSV and TXT."""
+"""Tables of projection matrices or ASTRA vectors: NPY, NPZ, CSV and TXT."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .files import atomic_path, write_text
 
 SUFFIXES = (".npy", ".npz", ".csv", ".txt")
 LAYOUTS = ("matrices", "astra")
-LARGEST = 1 << 26  # bytes of a table
-SPACING_AGREES = 1e-3
+LARGEST = 1 << 26  # table size in bytes
+SPACING_AGREES = 1e-3  # relative
 
 
 def read_matrix_table(
@@ -25,18 +25,18 @@ def read_matrix_table(
 ) -> ConeBeamGeometry:
     """The geometry of a table of 3 x 4 matrices or of ASTRA's `cone_vec`.
 
-    Matrices take world mm to 0-based pixels; as an array (V, 3, 4), or three lines of four numbers a view, or twelve
-    numbers a line. An NPZ holds one array, or names it `projection_matrices`.
+    Matrices map world mm to 0-based pixels. They are an array (V, 3, 4), three lines of four numbers per view, or one
+    line of twelve numbers per view. An NPZ file holds a single array, or the array is named `projection_matrices`.
 
     Args:
-        path: the file.
+        path: The file.
         det_shape: (rows, cols).
         pixel_spacing: (dv, du), mm.
-        layout: what twelve numbers a line are: "matrices" (rows first) or "astra" (source, detector centre, column
-            step, row step, in mm); told, never guessed.
+        layout: Meaning of twelve numbers per view: "matrices" (row by row) or "astra" (source, detector centre,
+            column step, row step, in mm). It must be given in that case; it is never guessed.
 
     Raises:
-        ValueError: what the file holds is no such table, or contradicts the pixel spacing.
+        ValueError: The file is no such table, or contradicts the pixel spacing.
     """
     if path.stat().st_size > LARGEST:
         raise ValueError(f"is larger than {LARGEST} bytes")
@@ -56,20 +56,20 @@ def read_matrix_table(
     if matrices is None:
         raise ValueError(f"must be V matrices of 3 x 4, got an array of shape {table.shape}")
     geometry = ConeBeamGeometry(torch.from_numpy(matrices.astype(np.float64)), det_shape, pixel_spacing)
-    _ = geometry.detector_distances  # raises where rows and columns contradict each other
+    _ = geometry.detector_distances  # raises if rows and columns are inconsistent
     return geometry
 
 
 def write_matrix_table(path: Path, geometry: ConeBeamGeometry, *, layout: str = "matrices") -> None:
-    """Writes matrices (V, 3, 4), or ASTRA's `cone_vec` (V, 12), as `read_matrix_table` reads them."""
+    """Write matrices (V, 3, 4), or ASTRA's `cone_vec` (V, 12), for `read_matrix_table`."""
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be {' or '.join(LAYOUTS)}, got {layout!r}")
     values = geometry.projection_matrices if layout == "matrices" else to_astra(geometry)
     array = values.detach().cpu().numpy()
     if path.suffix.lower() in (".csv", ".txt"):
-        between = "," if path.suffix.lower() == ".csv" else " "
+        separator = "," if path.suffix.lower() == ".csv" else " "
         flat = array.reshape(-1, array.shape[-1])
-        write_text(path, "".join(between.join(repr(float(x)) for x in line) + "\n" for line in flat))
+        write_text(path, "".join(separator.join(repr(float(x)) for x in line) + "\n" for line in flat))
         return
     with atomic_path(path) as part, open(part, "wb") as file:
         if path.suffix.lower() == ".npy":
@@ -85,7 +85,7 @@ def _table(path: Path) -> NDArray:
         return np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2)
     try:
         if suffix == ".npy":
-            return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))  # mapped: no more than the file holds
+            return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))  # mapping cannot exceed the file
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
         if unpacked > LARGEST:
@@ -95,6 +95,6 @@ def _table(path: Path) -> NDArray:
             if "projection_matrices" not in names and len(names) != 1:
                 raise ValueError(f"must hold one array, or name it projection_matrices, got {', '.join(names)}")
             return arrays["projection_matrices" if "projection_matrices" in names else names[0]]
-    except Exception as error:  # NumPy and zip archives fail in many ways, and each means a damaged file
+    except Exception as error:  # NumPy and zipfile raise various types on a damaged file
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ValueError(f"cannot be read: {reason[:120]}") from error

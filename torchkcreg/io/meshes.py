@@ -1,4 +1,4 @@
-"""Implant surfaces from CAD files, and point clouds for viewers."""
+"""Implant surfaces (STL, OBJ, PLY, OFF, 3MF, STEP, scanned volumes), and writing of PLY point clouds."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from .files import atomic_path, existing_file
 from .volumes import VOLUME_SUFFIXES, read_volume
 
 STEP_SUFFIXES = (".step", ".stp")
-DEFLECTION_MM, DEFLECTION_RAD = 0.005, 0.05  # of the surface's triangles from the true one
-SECONDS = 300  # given to a file
+DEFLECTION_MM, DEFLECTION_RAD = 0.005, 0.05  # largest deviation of the triangles from the true surface
+SECONDS = 300  # time limit per file
 _CONVERT = "import sys, cascadio; _, a, b, mm, rad = sys.argv; cascadio.step_to_glb(a, b, float(mm), float(rad))"
 _HEADER, _TRIANGLE = 84, 50  # bytes
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
@@ -37,10 +37,12 @@ _METRES_MM, _SMALLEST_MM, _LARGEST_MM = 1.0, 20.0, 1000.0
 
 
 def load_step(path: Path) -> trimesh.Trimesh:
-    """The surface of all bodies of a STEP file, in mm whatever unit it says, within 5 micrometres.
+    """The surface of all bodies of a STEP file, accurate to 5 micrometres.
+
+    The unit of the file is converted to mm.
 
     Raises:
-        ValueError: damaged, without a body, or cascadio is not installed.
+        ValueError: The file is damaged or holds no body, or cascadio is not installed.
     """
     if importlib.util.find_spec("cascadio") is None:
         raise ValueError("STEP files need cascadio: pip install 'torchkcreg[cad]'")
@@ -50,12 +52,12 @@ def load_step(path: Path) -> trimesh.Trimesh:
         try:
             done = subprocess.run(command, capture_output=True, timeout=SECONDS, check=False)
         except subprocess.TimeoutExpired:
-            raise ValueError(f"it takes longer than {SECONDS} s to be made a surface") from None
+            raise ValueError(f"its conversion to a surface takes longer than {SECONDS} s") from None
         if done.returncode != 0 or not target.is_file() or target.stat().st_size == 0:
             raise ValueError("it is no STEP file with a body")
         try:
             scene = trimesh.load(str(target), force="mesh", process=False)
-        except Exception as error:  # of a scene without a surface
+        except Exception as error:  # raised for a scene without a surface
             raise ValueError("it holds no surface") from error
     if not isinstance(scene, trimesh.Trimesh) or len(scene.faces) == 0:
         raise ValueError("it holds no surface")
@@ -64,12 +66,12 @@ def load_step(path: Path) -> trimesh.Trimesh:
 
 
 def load_stl(content: bytes) -> trimesh.Trimesh:
-    """The triangles of a binary or ASCII STL file, vertices not merged.
+    """The triangles of a binary or ASCII STL file; vertices are not merged.
 
-    A name in the first line means nothing, whatever its letters.
+    The name in the first line is ignored and may contain any bytes.
 
     Raises:
-        ValueError: it is cut off, longer than it says, or no STL.
+        ValueError: The file is truncated, longer than its triangle count implies, or no STL.
     """
     if is_text(content):
         return _load_text(content)
@@ -86,7 +88,7 @@ def load_stl(content: bytes) -> trimesh.Trimesh:
 
 
 def is_text(content: bytes) -> bool:
-    """Whether an STL is ASCII: binary ones may begin with "solid" too, but their length fits their count."""
+    """True if an STL is ASCII. A binary STL may also begin with "solid", but its length fits its triangle count."""
     if not content[:512].lstrip().lower().startswith(b"solid"):
         return False
     if len(content) >= _HEADER and len(content) == _HEADER + _TRIANGLE * struct.unpack_from("<I", content, 80)[0]:
@@ -115,18 +117,20 @@ def _soup(corners: np.ndarray) -> trimesh.Trimesh:
 
 
 def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
-    """The closed surface of an STL, OBJ, PLY, OFF, 3MF or STEP file, in mm, oriented outwards.
+    """Read a closed surface from an STL, OBJ, PLY, OFF, 3MF or STEP file, in mm, oriented outwards.
 
-    Of a volume (MHA, NRRD, NIfTI), a bench scan of the implant, it is the surface where values are half of the metal's,
-    in the volume's world; see `scanned_surface`.
-    3MF and STEP say their unit and are converted (extras io and cad); the others are taken to be in mm.
-    Equal vertices are merged, faces that this collapses dropped; several bodies in one file are one surface. A largest
-    extent under 1, under 20 or over 1000 mm gives a warning: the file is probably in metres, in cm or inches, or not in
-    mm.
+    From a volume (MHA, NRRD, NIfTI), such as a bench scan of the implant, the isosurface at half the metal's value is
+    extracted, in the volume's world coordinates; see `scanned_surface`.
+
+    3MF and STEP files state their unit and are converted (extras io and cad). The others are assumed to be in mm.
+    Duplicate vertices are merged, and faces that thereby collapse are dropped. Several bodies in one file become one
+    surface. A warning is given if the largest extent is below 1 mm (probably metres), below 20 mm (cm or inches) or
+    above 1000 mm (not mm).
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read as a mesh, is empty, or is open; the message counts the open edges.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file cannot be read as a mesh, is empty, or the surface is open; the message counts the open
+            edges.
     """
     path = existing_file(path, "mesh")
     if path.name.lower().endswith(VOLUME_SUFFIXES):
@@ -136,7 +140,7 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         raise ValueError(f"mesh file {path} must be one of {', '.join((*MESH_SUFFIXES, *VOLUME_SUFFIXES))}")
     try:
         mesh = _loaded(path, suffix)
-    except Exception as error:  # each of trimesh's parsers fails in its own way
+    except Exception as error:  # trimesh's parsers raise various types
         hint = " (3MF needs the package lxml)" if suffix == ".3mf" and _lacks("lxml") else ""
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ValueError(f"mesh file {path} cannot be read: {reason}{hint}") from error
@@ -146,14 +150,14 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         closed = closed_mesh(mesh)
     except ValueError as error:
         raise ValueError(f"mesh file {path}: {error}") from error
-    if suffix == ".3mf" and mesh.units:  # the one format that says its unit
+    if suffix == ".3mf" and mesh.units:  # the only other format that states its unit
         closed.apply_scale(trimesh.units.unit_conversion(mesh.units, "millimeters"))
     _warn_about_size(path, closed)
     return closed
 
 
 def _loaded(path: Path, suffix: str) -> trimesh.Trimesh:
-    """The mesh of a file, as it is."""
+    """The mesh of a file, unprocessed."""
     if suffix == ".stl":
         return load_stl(path.read_bytes())
     if suffix in STEP_SUFFIXES:
@@ -175,7 +179,7 @@ def _surface_of_volume(path: Path) -> trimesh.Trimesh:
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:
-    """Nothing; writes a surface, its format chosen by the suffix (.stl, .obj, .ply, .off)."""
+    """Write a surface in the format of the suffix (.stl, .obj, .ply, .off)."""
     suffix = Path(path).suffix.lower()
     if suffix not in WRITTEN_SUFFIXES:
         raise ValueError(f"meshes are written as {', '.join(WRITTEN_SUFFIXES)}, got {path}")
@@ -186,16 +190,16 @@ def write_mesh(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:
 def write_point_cloud_ply(
     path: str | os.PathLike[str], points: Tensor, displacement: Tensor | None = None, std: Tensor | None = None
 ) -> None:
-    """Nothing; writes points as a binary PLY that ParaView, MeshLab, CloudCompare and 3D Slicer open.
+    """Write points as a binary PLY for ParaView, MeshLab, CloudCompare and 3D Slicer.
 
     Args:
-        path: the file.
+        path: The file.
         points: (N, 3) in mm.
-        displacement: (N, 3) in mm, becomes the vertex fields `dx`, `dy`, `dz` and its length `displacement`.
-        std: expected error of each (N,), mm, becomes `std`.
+        displacement: (N, 3) in mm, written as the vertex fields `dx`, `dy`, `dz`, and its length as `displacement`.
+        std: Expected error of each point (N,), mm, written as `std`.
 
     Raises:
-        ValueError: shapes don't fit, or there is no point.
+        ValueError: The shapes do not fit, or there are no points.
     """
     if points.ndim != 2 or points.shape[-1] != 3 or len(points) == 0:
         raise ValueError(f"points must have shape (N, 3), N > 0, got {tuple(points.shape)}")

@@ -1,4 +1,4 @@
-"""Point clouds with their fields, as `write_point_cloud_ply` writes them."""
+"""Point clouds and reference shapes: reference points or surfaces, VTK files (VTU, VTP), and this library's PLY."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from .meshes import MESH_SUFFIXES, read_mesh
 from .tables import read_points
 
 CLOUD_SUFFIXES = (".csv", ".txt", ".xyz")
-_TRIANGLE = 5  # VTK's number of the cell type
+_TRIANGLE = 5  # VTK's cell type number
 LONGEST_HEADER = 4096  # bytes
 
 
 def read_reference(path: str | os.PathLike[str]) -> trimesh.Trimesh | Tensor:
-    """A reference shape in mm: a closed surface, or points (N, 3) float64.
+    """Read a reference shape in mm: a closed surface, or points (N, 3) float64.
 
-    CSV, TXT and XYZ hold points, x, y, z a line. A PLY holds points if it has no faces, such as the
-    `implant_deformed.ply` of a run; the other formats of `read_mesh` are surfaces.
+    CSV, TXT and XYZ files hold points, one x, y, z per line. A PLY without faces, such as the `implant_deformed.ply` of
+    a run, also holds points. The other formats of `read_mesh` hold surfaces.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is of no known format, cannot be read, holds no points, or a point that is not finite; a surface
-            is open.
+        FileNotFoundError: The file does not exist.
+        ValueError: The format is unknown, the file cannot be read, it holds no points or a non-finite point, or the
+            surface is open.
     """
     path = existing_file(path, "reference")
     suffix = path.suffix.lower()
@@ -44,10 +44,10 @@ def read_reference(path: str | os.PathLike[str]) -> trimesh.Trimesh | Tensor:
 
 
 def _ply_points(path: os.PathLike[str]) -> Tensor | None:
-    """The points of a PLY without faces; None where it has some."""
+    """The points of a PLY without faces; None if it has faces."""
     try:
         content = trimesh.load(str(path), process=False)
-    except Exception as error:  # the parser fails in its own ways
+    except Exception as error:  # the parser raises various types
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ValueError(f"reference file {path} cannot be read: {reason}") from error
     vertices = getattr(content, "vertices", ())
@@ -63,15 +63,15 @@ def _ply_points(path: os.PathLike[str]) -> Tensor | None:
 
 
 def write_surface_vtu(path: str | os.PathLike[str], mesh: trimesh.Trimesh, values: Mapping[str, Tensor]) -> None:
-    """Nothing; writes a triangle mesh with values at its vertices as VTK XML.
+    """Write a triangle mesh with values at its vertices as VTK XML (.vtu).
 
     Args:
         path: The file, ending in .vtu.
-        mesh: V vertices, mm.
-        values: Name to values (V,) or vectors (V, 3).
+        mesh: Mesh with V vertices, mm.
+        values: Scalars (V,) or vectors (V, 3), by name.
 
     Raises:
-        ValueError: A value does not belong to the vertices.
+        ValueError: The length of an array is not the number of vertices.
     """
     count = len(mesh.vertices)
     for name, value in values.items():
@@ -93,15 +93,15 @@ def write_surface_vtu(path: str | os.PathLike[str], mesh: trimesh.Trimesh, value
 
 
 def write_points_vtp(path: str | os.PathLike[str], points: Tensor, values: Mapping[str, Tensor]) -> None:
-    """Nothing; writes points with values as VTK XML, in single precision.
+    """Write points with values as VTK XML (.vtp), in single precision.
 
     Args:
         path: The file, ending in .vtp.
         points: (N, 3), mm.
-        values: Name to values (N,) or vectors (N, 3).
+        values: Scalars (N,) or vectors (N, 3), by name.
 
     Raises:
-        ValueError: A value does not belong to the points.
+        ValueError: The length of an array is not the number of points.
     """
     count = len(points)
     for name, value in values.items():
@@ -124,33 +124,37 @@ def write_points_vtp(path: str | os.PathLike[str], points: Tensor, values: Mappi
 
 
 def _packed(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
-    """Numbers as they lie in memory, after their number of bytes, in base64."""
+    """Append a binary DataArray: base64 of the number of bytes (uint64), followed by the raw values."""
     element = _array_element(parent, name, values, "Int64" if values.dtype.kind == "i" else "Float32", "binary")
     size = np.array([values.nbytes], dtype="<u8")
     element.text = base64.b64encode(size.tobytes() + np.ascontiguousarray(values).tobytes()).decode()
 
 
 def _array(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
-    whole = values.dtype.kind in "iu"
-    element = _array_element(parent, name, values, "Int64" if whole else "Float64", "ascii")
-    element.text = " ".join(str(x) for x in values.ravel()) if whole else " ".join(f"{x:.7g}" for x in values.ravel())
+    is_integer = values.dtype.kind in "iu"
+    element = _array_element(parent, name, values, "Int64" if is_integer else "Float64", "ascii")
+    element.text = (
+        " ".join(str(x) for x in values.ravel()) if is_integer else " ".join(f"{x:.7g}" for x in values.ravel())
+    )
 
 
 def _array_element(
     parent: ElementTree.Element, name: str, values: np.ndarray, kind: str, form: str
 ) -> ElementTree.Element:
-    about = {"type": kind, "Name": name, "format": form}
+    attributes = {"type": kind, "Name": name, "format": form}
     if values.ndim == 2:
-        about["NumberOfComponents"] = str(values.shape[1])
-    return ElementTree.SubElement(parent, "DataArray", about)
+        attributes["NumberOfComponents"] = str(values.shape[1])
+    return ElementTree.SubElement(parent, "DataArray", attributes)
 
 
 def read_point_cloud_ply(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """Columns (N,) of a binary PLY of this library by their names: x, y, z, and dx, dy, dz, displacement, std if there.
+    """Read a PLY of `write_point_cloud_ply`: columns (N,) by name.
+
+    The names are x, y, z, and, if present, dx, dy, dz, displacement, std.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is another kind of PLY, or shorter than its header says.
+        FileNotFoundError: The file does not exist.
+        ValueError: It is another kind of PLY, or its length does not fit its header.
     """
     content = existing_file(path, "point cloud").read_bytes()
     end = content.find(b"end_header\n", 0, LONGEST_HEADER)

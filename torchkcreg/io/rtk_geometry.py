@@ -1,4 +1,4 @@
-"""RTK's `ThreeDCircularProjectionGeometry` files (XML): read and written."""
+"""Reading and writing of RTK's `ThreeDCircularProjectionGeometry` files (XML)."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from torchkcreg.geometry.frames import DetectorFrames
 from .files import existing_file, write_text
 
 ROOT = "RTKThreeDCircularGeometry"
-LARGEST = 1 << 26  # bytes of a file: half a million views
-AGREEMENT = 1e-3  # between a view's parameters and its matrix, as a share of the largest entry
-PARAMETERS = (  # of a view, with what they are where a file does not say them
+LARGEST = 1 << 26  # file size in bytes, about half a million views
+AGREEMENT = 1e-3  # tolerance between a view's parameters and its matrix, relative to the largest entry
+PARAMETERS = (  # of a view; 0 if missing
     "SourceToIsocenterDistance",
     "SourceToDetectorDistance",
     "GantryAngle",
@@ -39,22 +39,23 @@ def read_rtk(
     pixel_spacing: Sequence[float],
     origin_mm: Sequence[float] | None = None,
 ) -> ConeBeamGeometry:
-    """The geometry of RTK's XML, in RTK's own world: the gantry turns about y.
+    """The geometry of an RTK XML file, in RTK's world coordinates: the gantry rotates about y.
 
-    RTK's matrices end in mm on the detector; which pixel that is the projections' header says: pixel (0, 0) has its
-    centre at the image's origin. `geometry.moved` takes it to another world, such as one whose z is the gantry's axis.
+    RTK's matrices map to mm on the detector. Their relation to pixels is given by the header of the projections: the
+    centre of pixel (0, 0) is the image's origin. Use `geometry.moved` to change the world, for example to one whose z
+    is the gantry's axis.
 
     Args:
-        path: the file.
+        path: The file.
         det_shape: (rows, cols) of the projections.
         pixel_spacing: (dv, du) of the projections, mm.
         origin_mm: (u, v) of the centre of pixel (0, 0), the origin of the projections' image. If None, the middle of
-            the detector is at 0: ``-(n - 1) / 2`` pixels, as RTK's own simulations have it.
+            the detector is at 0: the origin is `-(n - 1) / 2` pixels, as in RTK's own simulations.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no such geometry, of parallel rays, of a cylindrical detector, or a view's matrix is not that
-            of its parameters.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is no RTK geometry, describes parallel rays or a cylindrical detector, or the matrix of a
+            view does not agree with its parameters.
     """
     file = existing_file(path, "geometry")
     try:
@@ -78,10 +79,10 @@ def _of(
     shared = {name: _number(root, name, 0.0) for name in PARAMETERS}
     matrices, angles = [], []
     for view, element in enumerate(root.iter("Projection")):
-        told = {name: _number(element, name, value) for name, value in shared.items()}
-        if not told["SourceToDetectorDistance"] > 0:
+        parameters = {name: _number(element, name, value) for name, value in shared.items()}
+        if not parameters["SourceToDetectorDistance"] > 0:
             raise ValueError(f"view {view}: SourceToDetectorDistance must be positive, parallel rays are not read")
-        matrix = rtk_matrix(told)
+        matrix = rtk_matrix(parameters)
         written = element.find("Matrix")
         if written is not None:
             values = [_finite(word, "Matrix") for word in (written.text or "").split()]
@@ -92,7 +93,7 @@ def _of(
             if not float((given / (scale or math.nan) - matrix).abs().max()) < AGREEMENT * float(matrix.abs().max()):
                 raise ValueError(f"view {view}: Matrix is not that of its angles, distances and offsets")
         matrices.append(matrix)
-        angles.append(told["GantryAngle"])
+        angles.append(parameters["GantryAngle"])
     if not matrices:
         raise ValueError("has no Projection")
     rows, cols = det_shape
@@ -105,8 +106,8 @@ def _of(
 def rtk_matrix(parameters: dict[str, float]) -> Tensor:
     """RTK's matrix (3, 4) of a view: world mm to mm on the detector.
 
-    ``shift(source - projection offset) magnify(-SDD, -SID) shift(-source offset) rotate``, with the rotation about z by
-    minus the in-plane angle, x by minus the out-of-plane angle, and y by minus the gantry angle.
+    It is `shift(source offset - projection offset) magnify(-SDD, -SID) shift(-source offset) rotate`. The rotation is
+    Rz(-in-plane angle) Rx(-out-of-plane angle) Ry(-gantry angle).
     """
     gantry, out, inside = (
         math.radians(parameters[name]) for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")
@@ -132,17 +133,17 @@ def _about(axis: int, angle: float) -> Tensor:
 
 
 def write_rtk(path: str | os.PathLike[str], geometry: ConeBeamGeometry) -> None:
-    """Writes RTK's XML of a geometry, for projections whose middle is at 0: origin ``-(n - 1) / 2`` pixels.
+    """Write a geometry as RTK XML, for projections whose middle is at 0: origin `-(n - 1) / 2` pixels.
 
     Raises:
-        ValueError: rows and columns are not orthogonal, or make a mirror image of what RTK knows: turn the rows of
-            images and geometry around.
+        ValueError: Rows and columns are not orthogonal, or the detector is mirrored compared with RTK's convention:
+            reverse the rows of images and geometry.
     """
     views = [_parameters(*vectors) for vectors in zip(*vars(DetectorFrames.of(geometry)).values(), strict=True)]
     lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>", f'<{ROOT} version="3">']
-    for told in views:
-        matrix = "\n".join("      " + " ".join(f"{x:.15g}" for x in row) for row in rtk_matrix(told).tolist())
-        named = [f"    <{escape(name)}>{value:.15g}</{escape(name)}>" for name, value in told.items()]
+    for parameters in views:
+        matrix = "\n".join("      " + " ".join(f"{x:.15g}" for x in row) for row in rtk_matrix(parameters).tolist())
+        named = [f"    <{escape(name)}>{value:.15g}</{escape(name)}>" for name, value in parameters.items()]
         lines += ["  <Projection>", *named, "    <Matrix>", matrix, "    </Matrix>", "  </Projection>"]
     write_text(path, "\n".join([*lines, f"</{ROOT}>", ""]))
 
@@ -154,7 +155,7 @@ def _parameters(source: Tensor, center: Tensor, across: Tensor, down: Tensor) ->
         raise ValueError("RTK has rows and columns at right angles only")
     if float((source - center) @ normal) <= 0:
         raise ValueError("RTK has no mirror images: turn around the rows of images and geometry")
-    turn = torch.stack([u, v, normal])  # world to RTK's frame, in which the source is towards +z
+    turn = torch.stack([u, v, normal])  # rotation from the world to RTK's frame, in which the source is towards +z
     # turn = Rz(-inside) Rx(-out) Ry(-gantry)
     out = math.asin(max(-1.0, min(1.0, -float(turn[2, 1]))))
     gantry = math.atan2(float(turn[2, 0]), float(turn[2, 2]))
@@ -166,8 +167,8 @@ def _parameters(source: Tensor, center: Tensor, across: Tensor, down: Tensor) ->
 
 
 def _number(element: ET.Element, name: str, default: float) -> float:
-    found = element.find(name)
-    return default if found is None else _finite(found.text, name)
+    child = element.find(name)
+    return default if child is None else _finite(child.text, name)
 
 
 def _finite(text: str | None, name: str) -> float:

@@ -1,4 +1,4 @@
-"""Run folders: everything that a registration leaves behind, each file whole or not there."""
+"""Run folders of a registration: their files, package versions and overlay layers; each file is written atomically."""
 
 from __future__ import annotations
 
@@ -42,32 +42,32 @@ _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def write_layers(path: Path, layers: dict[str, Any]) -> None:
-    """Nothing; writes "grey" (V, h, w), "overlay" (V, h, w, 3), both uint8, and "labels" (V,) as an NPZ file."""
+    """Write the overlay layers as NPZ: "grey" (V, h, w) and "overlay" (V, h, w, 3), both uint8, and "labels" (V,)."""
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **{name: layers[name] for name in _NAMES})  # type: ignore[arg-type]
 
 
 def read_layers(path: Path) -> dict[str, Any] | None:
-    """What `write_layers` wrote; None where there is nothing, or it is damaged: a page does without."""
+    """Read the file of `write_layers`; None if it is missing or damaged, since the report works without it."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            held = {name: file[name] for name in _NAMES}
-    except Exception:  # numpy's, zipfile's and zlib's own
+            layers = {name: file[name] for name in _NAMES}
+    except Exception:  # numpy, zipfile and zlib raise various types
         return None
-    shape = held["grey"].shape
-    fits = len(shape) == 3 and held["overlay"].shape == (*shape, 3) and held["labels"].shape == shape[:1]
-    return held if fits and held["grey"].dtype == held["overlay"].dtype == np.uint8 else None
+    shape = layers["grey"].shape
+    fits = len(shape) == 3 and layers["overlay"].shape == (*shape, 3) and layers["labels"].shape == shape[:1]
+    return layers if fits and layers["grey"].dtype == layers["overlay"].dtype == np.uint8 else None
 
 
 def versions() -> dict[str, str | int]:
-    """Versions of Python, of the packages the numbers depend on, of the machine, and the number of threads.
+    """Versions of Python and of the packages that affect the results, the platform, and the number of threads.
 
     >>> sorted(versions())[:3]
     ['SimpleITK', 'cma', 'kornia']
     """
-    found: dict[str, str | int] = {package: _version(package) for package in _PACKAGES}
+    packages: dict[str, str | int] = {package: _version(package) for package in _PACKAGES}
     return {
-        **found,
+        **packages,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "processor": platform.machine(),
@@ -83,11 +83,11 @@ def _version(package: str) -> str:
 
 
 def implant_of_run(run_folder: Path, name: str | None = None) -> tuple[RegistrationResult, RegisteredImplant]:
-    """The result of a finished run and its implant of a name, the first one without.
+    """The result of a finished run and its implant with the given name, by default the first.
 
     Raises:
-        FileNotFoundError: If there is no finished run.
-        ValueError: If there is no implant of that name, or a file is damaged.
+        FileNotFoundError: There is no finished run.
+        ValueError: There is no implant of that name, or a file is damaged.
     """
     result = read_run(run_folder)
     try:
@@ -97,39 +97,39 @@ def implant_of_run(run_folder: Path, name: str | None = None) -> tuple[Registrat
 
 
 def mesh_of_run(run_folder: Path, number: int = 0) -> Path:
-    """The undeformed mesh of an implant of a run, by its number.
+    """Path of the undeformed mesh of an implant of a run, by the implant's number.
 
     Raises:
-        FileNotFoundError: If the run names none, or it is not there.
+        FileNotFoundError: The run's configuration names no mesh, or the file does not exist.
     """
     files = read_config(Path(run_folder) / "config.yaml").get("files")
     named = files.get("implant") if isinstance(files, dict) else None
     path: str | None = named[number] if isinstance(named, list) and named else named  # type: ignore[assignment]
     if path is None or not Path(path).is_file():
-        where = "names none" if path is None else f"names {path}, which is not there"
-        raise FileNotFoundError(f"the implant's undeformed mesh is needed, and run folder {run_folder} {where}")
+        problem = "names none" if path is None else f"names {path}, which is not there"
+        raise FileNotFoundError(f"the implant's undeformed mesh is needed, and run folder {run_folder} {problem}")
     return Path(path)
 
 
 class RunFolder:
-    """A registration on disk.
+    """Folder with all files of a registration.
 
-    | file | what |
+    | file | content |
     | --- | --- |
-    | `config.yaml` | the resolved configuration; there from the start |
+    | `config.yaml` | resolved configuration, written at the start |
     | `versions.json` | torchkcreg, torch, numpy, ..., platform, threads |
-    | `checkpoint.pt` | the trainer's state, replaced as the run goes on |
-    | `history.json` | a record an iteration |
-    | `metrics.json` | what was measured |
-    | `deformation.json` | all parameters of the result; written last, so where it is the run is complete |
-    | `arrays.npz` | what of it is too long for JSON: how an implant may be off, and responds to loads |
+    | `checkpoint.pt` | state of the trainer, updated during the run |
+    | `history.json` | one record per iteration |
+    | `metrics.json` | metrics of the run |
+    | `deformation.json` | all parameters of the result; written last, so its presence marks a complete run |
+    | `arrays.npz` | large arrays of `deformation.json`: error fields of an implant and its response to loads |
     | `uncertainty.json` | expected errors, see `uncertainty_of` |
     | `dvf.mha` | displacement field, see `displacement_field` |
     | `bspline.tfm` | ITK transform, see `itk_transform` |
-    | `implant_deformed.ply`, `.vtp` | deformed point cloud with the displacement and expected error of each node |
+    | `implant_deformed.ply`, `.vtp` | deformed point cloud with displacement and expected error of each node |
     | `overlay.png`, `displacement.png`, `history.png` | figures |
-    | `overlay.npz`, `report.html` | views with and without the implant, and the page that shows them |
-    | `seeds/<seed>/` | a run folder of each seed, where several were run |
+    | `overlay.npz`, `report.html` | views with and without the implant overlay, and the report page that shows them |
+    | `seeds/<seed>/` | run folder of each seed, if several seeds were run |
 
     Use `RunFolder.create` for a new or resumed run and `read_run` for a finished one.
     """
@@ -139,18 +139,18 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, overwrite: bool = False, resume: bool = False) -> RunFolder:
-        """A run folder ready to be written to.
+        """Create or open a run folder for writing.
 
         Args:
-            path: the folder; made, parents too, where it does not exist. An empty one is taken as it is.
-            overwrite: discard the run in it: the files that a run writes are deleted, others stay.
-            resume: go on with the run in it.
+            path: The folder. It is created with its parents if missing. An existing empty folder is used.
+            overwrite: Discard an existing run: the files written by a run are deleted, other files stay.
+            resume: Continue an existing run.
 
         Raises:
-            FileExistsError: there is a run and neither is asked for, or files that are no run.
-            FileNotFoundError: there is no run to resume.
-            NotADirectoryError: the path, or one above it, is a file.
-            ValueError: both are asked for.
+            FileExistsError: The folder holds a run and neither `overwrite` nor `resume` is set, or other files.
+            FileNotFoundError: There is no run to resume.
+            NotADirectoryError: The path or one of its parents is a file.
+            ValueError: Both `overwrite` and `resume` are set.
         """
         if overwrite and resume:
             raise ValueError("a run is either overwritten or resumed, not both")
@@ -170,29 +170,30 @@ class RunFolder:
         return run
 
     def start(self, config: dict[str, Any]) -> None:
-        """Nothing; writes `config.yaml`, which makes the folder a run, and `versions.json`."""
+        """Write `config.yaml`, which marks the folder as a run, and `versions.json`."""
         write_config(self.path / CONFIG, config)
         write_json(self.path / VERSIONS, versions())
 
     def of_seed(self, seed: int) -> RunFolder:
-        """The run folder, made anew, that keeps the run of one seed of several."""
+        """Create the run folder of one of several seeds."""
         return RunFolder.create(self.path / SEEDS / str(seed))
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
-        """Nothing; writes the checkpoint, in place of the last one only when it is whole.
+        """Write the checkpoint atomically, replacing the last one.
 
         Raises:
-            ValueError: something in it is neither a tensor nor plain data, and where; it could not be loaded safely.
+            ValueError: The state holds something other than tensors and plain data, which could not be loaded safely.
+                The message names its place.
         """
         require_loadable(state, "state")
         with atomic_path(self.path / CHECKPOINT) as temporary:
             torch.save(state, temporary)
 
     def load_checkpoint(self) -> dict[str, Any] | None:
-        """The last checkpoint, on the CPU, or None where there is none yet; nothing in the file is executed.
+        """Load the last checkpoint to the CPU; None if there is none. Nothing in the file is executed.
 
         Raises:
-            ValueError: the file cannot be read.
+            ValueError: The file cannot be read.
         """
         path = self.path / CHECKPOINT
         if not path.is_file():
@@ -204,15 +205,15 @@ class RunFolder:
             raise ValueError(f"checkpoint {path} cannot be read: {reason[:120]}") from error
 
     def write_history(self, history: list[dict[str, Any]]) -> None:
-        """Nothing; writes `history.json`."""
+        """Write `history.json`."""
         write_json(self.path / HISTORY, history)
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Nothing; writes `metrics.json`."""
+        """Write `metrics.json`."""
         write_json(self.path / METRICS, metrics)
 
     def write_figure(self, name: str, figure: Figure) -> None:
-        """Nothing; writes a figure under a file name such as `overlay.png`."""
+        """Write a figure under a file name such as `overlay.png`."""
         if Path(name).name != name or Path(name).suffix not in _FIGURE_SUFFIXES:
             raise ValueError(f"name must be a file name ending in {', '.join(_FIGURE_SUFFIXES)}, got {name!r}")
         write_figure(self.path / name, figure)
@@ -220,21 +221,21 @@ class RunFolder:
     def write_result(
         self, result: RegistrationResult, points: Sequence[Tensor], *, initial_to_world: Sequence[Tensor] | None = None
     ) -> None:
-        """Nothing; writes history, displacement field, ITK transform, deformed cloud and, last, `deformation.json`.
+        """Write history, displacement field, ITK transform, deformed cloud and, last, `deformation.json`.
 
-        The files of a second implant, and of more, begin with its name.
+        File names of the second and further implants are prefixed with the implant's name.
 
         Args:
-            result: the registration.
-            points: nodes (N, 3) of each implant in its own frame.
-            initial_to_world: pose (4, 4) of each from which the cloud's displacements are counted; the identity if not
-                given.
+            result: The registration.
+            points: Nodes (N, 3) of each implant, in the implant's frame.
+            initial_to_world: Pose (4, 4) of each implant relative to which the cloud's displacements are computed; by
+                default the identity.
 
         Raises:
-            ValueError: a parameter is not finite.
+            ValueError: A parameter is not finite.
         """
         content, arrays = without_arrays(result.to_dict())
-        content = plain(content)  # refuses what cannot be written before anything is
+        content = plain(content)  # raises on invalid content before any file is touched
         for name in (DEFORMATION, ARRAYS):
             (self.path / name).unlink(missing_ok=True)
         self.write_history(result.history)
@@ -258,7 +259,7 @@ class RunFolder:
         write_json(self.path / DEFORMATION, content, indent=None)
 
     def read_result(self) -> RegistrationResult:
-        """The result in the folder; see `read_run`."""
+        """Read the result in the folder; see `read_run`."""
         path = self.path / DEFORMATION
         if not path.is_file():
             state = "is not finished" if (self.path / CONFIG).is_file() else "is no run"
@@ -271,7 +272,7 @@ class RunFolder:
             raise ValueError(f"deformation file {path}: {' '.join(str(error).split())}") from error
 
     def _discard(self, names: tuple[str, ...]) -> None:
-        for leftover in self.path.glob(f"{TEMPORARY_PREFIX}*"):  # of a run that was killed while writing
+        for leftover in self.path.glob(f"{TEMPORARY_PREFIX}*"):  # from a run that was killed while writing
             leftover.unlink(missing_ok=True)
         for name in names:
             (self.path / name).unlink(missing_ok=True)
@@ -291,7 +292,7 @@ class RunFolder:
 
 
 def uncertainty_of(result: RegistrationResult) -> dict[str, Any]:
-    """Expected errors of a registration: of its nodes as a whole, and of each implant across and along the rays, mm."""
+    """Expected errors of a registration, mm: of all nodes, and of each implant across and along the rays."""
     implants = {}
     for implant in result.implants:
         if implant.deviations is not None:
@@ -302,16 +303,16 @@ def uncertainty_of(result: RegistrationResult) -> dict[str, Any]:
 
 
 def read_run(path: str | os.PathLike[str]) -> RegistrationResult:
-    """The result of a finished registration, in float64: it warps points as the result that was written did.
+    """Read the result of a finished registration, in float64. It warps points exactly as the written result.
 
-    One that is not to be trusted is read too, with a warning that says why.
+    A result whose status is not "ok" is read with a warning that gives the reasons.
 
     Args:
-        path: the run folder.
+        path: The run folder.
 
     Raises:
-        FileNotFoundError: there is no such folder, or the run in it is not finished.
-        ValueError: the files in it are damaged; the message names the file and the key.
+        FileNotFoundError: The folder does not exist, or its run is not finished.
+        ValueError: A file is damaged; the message names the file and the key.
     """
     if not Path(path).is_dir():
         raise FileNotFoundError(f"run folder {path} does not exist")

@@ -1,4 +1,4 @@
-"""Tables of numbers as text: separator and decimal sign are recognised, names of columns count, doubts are refused."""
+"""Text tables of numbers, points and spectra. Separator and decimal sign are detected; ambiguous files are rejected."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _UNITS = {"um", "µm", "mm", "cm", "m", "in", "inch", "ev", "kev", "mev"}
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?", re.ASCII)
 _READINGS = [(";", _POINT), (";", _COMMA), ("\t", _POINT), ("\t", _COMMA), (",", _POINT), (",", _COMMA)]
-_READINGS += [("", _POINT), ("", _COMMA)]  # blanks
+_READINGS += [("", _POINT), ("", _COMMA)]  # separated by blanks
 _LARGEST_KEV = 1000.0
 _Rows = list[tuple[int, list[str]]]
 
 
 class _Refused(ValueError):
-    """No table in this reading, for a reason that shows in a line."""
+    """The table cannot be parsed with the assumed separator and decimal sign; the reason names the line."""
 
     def __init__(self, line: int, why: str) -> None:
         super().__init__(f", line {line}: {why}" if line else f" {why}")
@@ -38,13 +38,13 @@ class _Refused(ValueError):
 
 @dataclass(frozen=True)
 class Column:
-    """A column that is wanted.
+    """A requested column.
 
     Attributes:
-        name: How messages, and most files, call it.
-        unit: The one it is in; a header that says another is refused.
-        others: Further names it goes by.
-        any_name: Where one column is left, it is this one, whatever its name.
+        name: Name in messages and in most files.
+        unit: Unit of the values. A header with another unit is rejected.
+        others: Alternative names.
+        any_name: If only one column remains unassigned, use it whatever its name.
     """
 
     name: str
@@ -63,19 +63,19 @@ _XYZ = [Column(axis, "mm") for axis in "xyz"]
 def read_table(path: str | os.PathLike[str], what: str, columns: Sequence[Column]) -> NDArray[np.float64]:
     """Columns of a text table as an array (rows, len(columns)).
 
-    Cells stand between commas, semicolons, tabs or blanks, as all lines agree; numbers have points or, but between
-    commas, decimal commas. Comments begin with #. If the first line holds names, columns are taken by them, whatever
-    stands beside; without names there must be as many columns as are wanted.
+    Cells are separated by commas, semicolons, tabs or blanks, the same in all lines. Numbers have decimal points, or
+    decimal commas unless commas separate the cells. Comments begin with #. If the first line holds names, columns are
+    selected by name and further columns are ignored. Without names, the number of columns must match.
 
     Args:
         path: The file.
-        what: What it is, for messages ("points", "spectrum").
-        columns: What is wanted of it.
+        what: Kind of file, for messages ("points", "spectrum").
+        columns: Requested columns.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: Names or a unit are others, a line has more or fewer columns than the first, separators or decimal
-            signs change, or a cell is empty or no finite number; the message names file and line.
+        FileNotFoundError: The file does not exist.
+        ValueError: A name or unit does not match, a line has more or fewer columns than the first, separators or
+            decimal signs change, or a cell is empty or no finite number. The message names file and line.
     """
     texts = enumerate(read_text(path, what).splitlines(), start=1)
     lines = [(n, text) for n, line in texts if (text := line.split("#", 1)[0].strip(" \r")).strip()]
@@ -94,12 +94,12 @@ def _parse(lines: list[tuple[int, str]], columns: Sequence[Column]) -> NDArray[n
             continue
         try:
             rows = [(line, _split(line, text, separator)) for line, text in lines]
-            return _numbers(rows, number, columns)  # no other reading would do: no number holds a separator
+            return _numbers(rows, number, columns)  # unambiguous: no number contains a separator
         except _Refused as failure:
             failures.append(failure)
     if not failures:
         raise _Refused(lines[0][0], f"expected {len(columns)} columns, got {lines[0][1][:60]!r}")
-    raise max(failures, key=lambda failure: failure.line)  # what could be read furthest; of equals the first
+    raise max(failures, key=lambda failure: failure.line)  # the attempt that got furthest; the first of equals
 
 
 def _split(line: int, text: str, separator: str) -> list[str]:
@@ -112,51 +112,53 @@ def _split(line: int, text: str, separator: str) -> list[str]:
 
 
 def _numbers(rows: _Rows, number: re.Pattern[str], columns: Sequence[Column]) -> NDArray[np.float64]:
-    """The wanted columns in one reading of the cells."""
-    wanted = ", ".join(c.name for c in columns)
+    """The requested columns, with the cells parsed by one number format."""
+    column_names = ", ".join(c.name for c in columns)
     titled = not any(_POINT.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in rows[0][1])
     body = rows[titled:]
     if not body:
-        raise _Refused(0, f"holds no rows of {wanted}")
+        raise _Refused(0, f"holds no rows of {column_names}")
     while all(len(cells) > len(columns) and not cells[-1] for _, cells in rows):
         rows = [(line, cells[:-1]) for line, cells in rows]
         body = rows[titled:]
     line, first = rows[0]
     if not titled and len(first) != len(columns):
         more = ": name the columns in a first line" if len(first) > len(columns) else ""
-        raise _Refused(line, f"expected numbers {wanted}, got {len(first)} columns{more}")
+        raise _Refused(line, f"expected numbers {column_names}, got {len(first)} columns{more}")
     places = _places(line, first, columns) if titled else range(len(columns))
     table = []
     for line, cells in body:
         if len(cells) != len(first):
-            raise _Refused(line, f"expected numbers {wanted} in {len(first)} columns, got {len(cells)} columns")
+            raise _Refused(line, f"expected numbers {column_names} in {len(first)} columns, got {len(cells)} columns")
         chosen = [cells[place] for place in places]
         for column, cell in zip(columns, chosen):
             if not number.fullmatch(cell) or not np.isfinite(float(cell.replace(",", "."))):
-                raise _Refused(line, f"expected numbers {wanted}, got {cell[:40]!r} as {column.name}")
+                raise _Refused(line, f"expected numbers {column_names}, got {cell[:40]!r} as {column.name}")
         table.append([float(cell.replace(",", ".")) for cell in chosen])
     return np.array(table, dtype=np.float64)
 
 
 def _places(line: int, titles: list[str], columns: Sequence[Column]) -> list[int]:
-    """Where the wanted columns stand by their names."""
+    """Positions of the requested columns, found by name."""
     names, units = zip(*map(_name_and_unit, titles))
-    left = list(range(len(titles)))
+    remaining = list(range(len(titles)))
     places = []
     for column in columns:
         known = {column.name, *column.others}
-        found = [
-            i for i in left if names[i] in known or (not names[i] and column.unit and units[i] == column.unit.lower())
+        matches = [
+            i
+            for i in remaining
+            if names[i] in known or (not names[i] and column.unit and units[i] == column.unit.lower())
         ]
-        if not found and column.any_name and len(left) == 1:
-            found = left
-        if len(found) != 1:
-            what = "no column" if not found else f"{len(found)} columns"
+        if not matches and column.any_name and len(remaining) == 1:
+            matches = remaining
+        if len(matches) != 1:
+            what = "no column" if not matches else f"{len(matches)} columns"
             raise _Refused(line, f"expected columns {', '.join(c.name for c in columns)}, got {what} {column.name}")
-        if units[found[0]] and units[found[0]] != column.unit.lower():
-            raise _Refused(line, f"column {titles[found[0]]!r} must be in {column.unit or 'no unit'}")
-        places.append(found[0])
-        left = [i for i in left if i != found[0]]
+        if units[matches[0]] and units[matches[0]] != column.unit.lower():
+            raise _Refused(line, f"column {titles[matches[0]]!r} must be in {column.unit or 'no unit'}")
+        places.append(matches[0])
+        remaining = [i for i in remaining if i != matches[0]]
     return places
 
 
@@ -167,7 +169,7 @@ def _name_and_unit(title: str) -> tuple[str, str]:
 
 
 def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as CSV, a column a key; a row without a key leaves its cell empty."""
+    """Write rows as CSV with one column per key. A cell is empty if the row lacks the key."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, lineterminator="\n")
@@ -177,25 +179,25 @@ def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) 
 
 
 def read_points(path: str | os.PathLike[str]) -> Tensor:
-    """Points (N, 3) float64 in mm from a text table: columns named x, y, z, or three columns without names.
+    """Read points (N, 3) float64 in mm from a text table: columns named x, y, z, or three columns without names.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no such table, see `torchkcreg.io.tables.read_table`; the message names the line.
+        FileNotFoundError: The file does not exist.
+        ValueError: It is no such table, see `torchkcreg.io.tables.read_table`; the message names the line.
     """
     return torch.from_numpy(read_table(path, "points", _XYZ))
 
 
 def write_points(path: str | os.PathLike[str], points: Tensor, **columns: Tensor) -> None:
-    """Nothing; writes points as CSV with a header line, in the given order, to a millionth of a mm.
+    """Write points as CSV with a header line, in the given order, with six decimals.
 
     Args:
-        path: the file.
+        path: The file.
         points: (N, 3) in mm.
-        **columns: further columns by name, each (N,): flags as 0 and 1, numbers with six decimals.
+        **columns: Further columns by name, each (N,): floats with six decimals, flags as 0 and 1.
 
     Raises:
-        ValueError: shapes don't fit, or a point is not finite.
+        ValueError: The shapes do not fit, or a point is not finite.
     """
     array = points.detach().cpu().double().numpy()
     if array.ndim != 2 or array.shape[1] != 3:
@@ -213,11 +215,11 @@ def write_points(path: str | os.PathLike[str], points: Tensor, **columns: Tensor
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
-    """The spectrum of a text table: energy in keV and the weight with which the detector counts it (any scale).
+    """Read a spectrum from a text table: energy in keV and detected weight (arbitrary scale).
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: energies are not positive, not rising, or too large for keV; a weight is negative, or all are 0.
+        FileNotFoundError: The file does not exist.
+        ValueError: Energies are not positive, not increasing, or too large for keV; a weight is negative, or all are 0.
     """
     table = read_table(path, "spectrum", _COLUMNS)
     energies, weights = table[:, 0], table[:, 1]
@@ -233,6 +235,6 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
 
 
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum) -> None:
-    """Nothing; writes a spectrum as `read_spectrum` reads it."""
+    """Write a spectrum as a text table for `read_spectrum`."""
     rows = [f"{float(e):.6g},{float(w):.9g}" for e, w in zip(spectrum.energies_kev, spectrum.weights)]
     write_text(path, "# energy_keV,detected_weight\n" + "\n".join(rows) + "\n")

@@ -1,4 +1,4 @@
-"""A registered deformation for other programs: an ITK transform and a displacement field."""
+"""Export of a registered deformation: ITK transform and displacement field."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ _DVF_BLOCK = 65536
 
 
 def itk_transform(implant_to_world: Tensor, deformation: SplineField) -> sitk.CompositeTransform:
-    """The ITK transform that maps points of the implant's frame to the world: T(x) = implant_to_world(x + u(x)).
+    """ITK transform that maps points from the implant's frame to the world: T(x) = implant_to_world(x + u(x)).
 
     A composite of a cubic `BSplineTransform` on the control-point grid (applied first) and an `AffineTransform` with
-    the rigid pose. `TransformPoint` agrees with ours to rounding inside the grid's valid domain, control points 1 to
-    n - 2 of each axis; beyond it ITK's B-spline stops at zero, where ours goes on with the nearest group's motion.
-    Coordinates are ITK's physical ones (3 D Slicer: LPS), and as always in ITK the transform maps points from the
-    space of the *output* image: resampling a world image with it gives the image in the implant's frame.
+    the rigid pose. Inside the grid's valid domain (control points 1 to n - 2 of each axis) `TransformPoint` agrees with
+    `warp` up to rounding. Outside it, the displacement of ITK's B-spline is zero, whereas `warp` continues with the
+    motion of the nearest group of control points. Coordinates are ITK's physical ones (LPS in 3D Slicer). As always in
+    ITK, the transform maps points from the space of the *output* image: resampling a world image with it gives the
+    image in the implant's frame.
 
     Args:
-        implant_to_world: rigid (4, 4).
-        deformation: displacements of the control points.
+        implant_to_world: Rigid transform (4, 4).
+        deformation: Displacements of the control points.
     """
     spline = sitk.BSplineTransform(3, 3)
     grid = deformation.grid
@@ -52,7 +53,7 @@ def itk_transform(implant_to_world: Tensor, deformation: SplineField) -> sitk.Co
 
 
 def write_itk_transform(path: str | os.PathLike[str], implant_to_world: Tensor, deformation: SplineField) -> None:
-    """Nothing; writes `itk_transform` as a .tfm that SimpleITK, ITK and 3D Slicer read."""
+    """Write `itk_transform` as a .tfm file for SimpleITK, ITK and 3D Slicer."""
     with atomic_path(path) as temporary:
         sitk.WriteTransform(itk_transform(implant_to_world, deformation), str(temporary))
 
@@ -65,23 +66,24 @@ def displacement_field(
     spacing_mm: float = 2.0,
     margin_mm: float = 15.0,
 ) -> sitk.Image:
-    """The displacement field T(x) - x as a vector image over the implant's frame, in mm.
+    """Displacement field T(x) - x as a vector image over the implant's frame, mm.
 
-    The image lies along the axes of a spline's grid and covers its valid domain, or along those of the implant's frame
-    and covers the implant, plus a margin. Its voxel
-    positions are x in the implant's frame and its vectors lead to the world, T(x) = x + field(x): where the implant was
-    modelled in its place (implant frame = world) that is its motion; where it comes from a CAD frame the change of
-    frame is in it. Every voxel has what `warp` gives there, also beyond the valid domain.
+    For a spline, the image is aligned with the control-point grid and covers its valid domain plus a margin. For other
+    models, it is aligned with the axes of the implant's frame and covers the implant plus a margin.
+
+    Voxel positions x are in the implant's frame, and T(x) = x + field(x) is in the world. If the implant was modelled
+    in place (implant frame = world), the field is its motion. If it comes from a CAD frame, the field includes the
+    change of frame. Every voxel has the value of `warp`, also outside the valid domain.
 
     Args:
-        implant_to_world: rigid (4, 4).
-        deformation: of any model.
-        points: nodes (N, 3) of the implant.
-        spacing_mm: largest voxel size.
-        margin_mm: how far the image reaches beyond the valid domain.
+        implant_to_world: Rigid transform (4, 4).
+        deformation: Deformation of any model.
+        points: Nodes (N, 3) of the implant.
+        spacing_mm: Largest voxel size.
+        margin_mm: Margin around the valid domain or the implant.
 
     Returns:
-        Image of float32 vectors; its index runs along the grid's axes.
+        Image of float32 vectors. Its indices run along the axes of the grid.
     """
     frame, low, high = _domain(deformation, points)
     starts, steps, counts = [], [], []
@@ -105,7 +107,7 @@ def displacement_field(
 
 
 def _domain(deformation: Deformation, points: Tensor) -> tuple[Tensor, list[float], list[float]]:
-    """Frame (4, 4) of a box, and its two corners there: where the deformation says something."""
+    """Domain of the deformation: frame (4, 4) of a box and its lowest and highest corner in that frame."""
     if isinstance(deformation, SplineField):
         grid = deformation.grid
         ends = [(n - 2) * s for n, s in zip(grid.shape, grid.spacing, strict=True)]
@@ -117,7 +119,7 @@ def _domain(deformation: Deformation, points: Tensor) -> tuple[Tensor, list[floa
 def write_displacement_field(
     path: str | os.PathLike[str], implant_to_world: Tensor, deformation: Deformation, points: Tensor
 ) -> None:
-    """Nothing; writes `displacement_field` as an image (.mha, .nrrd), compressed."""
+    """Write `displacement_field` as a compressed image (.mha, .nrrd)."""
     with atomic_path(path) as temporary:
         sitk.WriteImage(displacement_field(implant_to_world, deformation, points), str(temporary), useCompression=True)
 

@@ -1,4 +1,4 @@
-"""Volumes with their geometry: MHA, NRRD, NIfTI."""
+"""Volumes with their voxel grid: MHA, NRRD, NIfTI."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ VOLUME_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nii", ".nii.gz")
 
 
 def write_volume(path: str | os.PathLike[str], volume: Tensor, grid: VolumeGrid) -> None:
-    """Nothing; writes a volume (D, H, W) with its grid, whole or not at all, its format chosen by the suffix.
+    """Write a volume (D, H, W) with its grid atomically, in the format of the suffix.
 
-    Positions are ITK's physical ones (LPS), and what reads them (3D Slicer, SimpleITK) sees the voxels where `grid` has
-    them. Integer volumes keep their type, all others become float32.
+    Positions are ITK's physical ones (LPS), so 3D Slicer and SimpleITK place the voxels as `grid` does. Integer volumes
+    keep their type, all others become float32.
 
     Raises:
-        ValueError: shapes differ, or the suffix is none of .mha, .nrrd, .nii, .nii.gz.
+        ValueError: The shapes differ, or the suffix is none of .mha, .nrrd, .nii, .nii.gz.
     """
     if tuple(volume.shape) != tuple(grid.shape):
         raise ValueError(f"volume must have the grid's shape {tuple(grid.shape)}, got {tuple(volume.shape)}")
@@ -44,8 +44,8 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Tensor, VolumeGrid]:
     """A volume (D, H, W), float32 or float64, and its grid, from .mha, .mhd, .nrrd, .nii or .nii.gz.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or is no scalar volume of three dimensions.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file cannot be read, or is not a scalar volume of three dimensions.
     """
     path = existing_file(path, "volume")
     if not path.name.lower().endswith(VOLUME_SUFFIXES):
@@ -58,8 +58,8 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Tensor, VolumeGrid]:
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
         raise ValueError(f"volume file {path} must hold a scalar volume of three dimensions")
     array = sitk.GetArrayFromImage(image)
-    kept = np.float64 if array.dtype == np.float64 else np.float32
+    dtype = np.float64 if array.dtype == np.float64 else np.float32
     direction = np.asarray(image.GetDirection()).reshape(3, 3)
-    left, _, right = np.linalg.svd(direction)  # NIfTI keeps float32 quaternions: make it orthonormal again
+    left, _, right = np.linalg.svd(direction)  # NIfTI stores float32 quaternions: make the matrix orthonormal again
     grid = VolumeGrid(array.shape, image.GetSpacing(), image.GetOrigin(), tuple(map(tuple, left @ right)))
-    return torch.from_numpy(np.ascontiguousarray(array, dtype=kept)), grid
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=dtype)), grid

@@ -1,6 +1,7 @@
-"""Operators of torch's dispatcher (`torch.ops.torchkcreg`) and the backends that serve them: a readable reference in
-plain torch for any device, C++ for CPUs (sources in ``csrc``), Triton for GPUs (in ``gpu``). The derivatives are in
-`differentiable`.
+"""Operators of torch's dispatcher (`torch.ops.torchkcreg`) and their backends.
+
+There is a readable reference in plain torch for any device, C++ for CPUs (sources in `csrc`) and Triton for GPUs (in
+`gpu`). Derivatives are in `differentiable`.
 """
 
 from .backends import BACKENDS, Backend, Operator, backend_names, choose_backend, kernel

@@ -1,4 +1,4 @@
-"""The backends there are, and which one serves a request."""
+"""Operators, the available backends, and the choice of a backend."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _TRITON = frozenset(
 
 
 class Operator:
-    """An operator ``torch.ops.torchkcreg.<name>``: what it is called with, what comes out, and a readable definition.
+    """Operator `torch.ops.torchkcreg.<name>`: its schema, the shapes of its results, and a reference in plain torch.
 
-    The definition serves every device for which no backend has a kernel; backends register theirs with the dispatcher,
-    in C++ or in Python. Derivatives are not the operator's, see `torchkcreg.kernels.differentiable`.
+    The reference is used on every device for which no backend has a kernel. Backends register their kernels with the
+    dispatcher, in C++ or in Python. Operators have no derivatives, see `torchkcreg.kernels.differentiable`.
 
     Args:
-        schema: Name and arguments, as `torch.library` takes them.
-        reference: The definition in plain torch, differentiable by autograd.
-        fake: Empty results of the right shapes, for tracing.
+        schema: Name and arguments, in the form of `torch.library`.
+        reference: Implementation in plain torch, differentiable by autograd.
+        fake: Returns empty results of the right shapes, for tracing.
     """
 
     def __init__(self, schema: str, *, reference: Callable[..., Any], fake: Callable[..., Any]) -> None:
@@ -47,26 +47,26 @@ class Operator:
 
     @staticmethod
     def register(kernels: Mapping[str, Callable[..., Any]], device: str) -> None:
-        """Gives the dispatcher kernels, by the names of their operators, for a type of device such as "CUDA"."""
+        """Register kernels, by the names of their operators, for a type of device such as "CUDA"."""
         for name, kernel in kernels.items():
             _LIBRARY.impl(name, kernel, device)
 
     @property
     def dispatched(self) -> Callable[..., Any]:
-        """The operator as torch dispatches it, by the device of its arguments."""
+        """Operator that torch dispatches by the device of its arguments."""
         return getattr(torch.ops.torchkcreg, self.name)
 
 
 @dataclass(frozen=True)
 class Backend:
-    """Something that computes operators on some devices.
+    """Set of kernels for some types of devices.
 
     Attributes:
-        name: What users call it.
-        devices: Types of devices that it serves, such as "cpu"; None: every one.
-        unavailable: Makes its kernels ready at the first call; None, or why they cannot be had.
-        operators: Names of the operators that it has kernels for; None: all.
-        is_reference: It is the readable definition, correct and slow.
+        name: Name for users.
+        devices: Supported types of devices, such as "cpu". None: all.
+        unavailable: Loads the kernels at the first call. Returns None, or the reason why they are not available.
+        operators: Names of the operators that it has kernels for. None: all.
+        is_reference: True for the readable reference, which is correct but slow.
     """
 
     name: str
@@ -76,14 +76,14 @@ class Backend:
     is_reference: bool = False
 
     def serves(self, device: str, operator: str | None) -> bool:
-        """Whether it has a kernel of an operator for a type of device."""
+        """True if it has a kernel of the operator (None: any) for a type of device."""
         on_device = self.devices is None or device in self.devices
         return on_device and (operator is None or self.operators is None or operator in self.operators)
 
 
 @functools.cache
 def _triton_unavailable() -> str | None:
-    """None where Triton's kernels are the dispatcher's, else why they are not."""
+    """Register Triton's kernels. Returns None, or the reason why they are not available."""
     try:
         from .gpu import KERNELS
     except ImportError as error:
@@ -92,7 +92,7 @@ def _triton_unavailable() -> str | None:
     return None
 
 
-# The first that serves a request is what "auto" takes.
+# "auto" takes the first that has a kernel.
 BACKENDS: tuple[Backend, ...] = (
     Backend("cpp", frozenset({"cpu"}), unavailable_reason),
     Backend("triton", frozenset({"cuda"}), _triton_unavailable, operators=_TRITON),
@@ -101,33 +101,33 @@ BACKENDS: tuple[Backend, ...] = (
 
 
 def backend_names() -> tuple[str, ...]:
-    """What a user may ask for."""
+    """Names that a user may choose."""
     return ("auto", *(backend.name for backend in BACKENDS))
 
 
 def choose_backend(data: Tensor, name: str = "auto", *, operator: str | None = None) -> Backend:
-    """The backend that serves a request on the device of the data.
+    """Backend for an operator on the device of the data.
 
-    Where "auto" ends at the slow reference on a device that could have kernels, a warning says so, once.
+    Warns once if "auto" falls back to the slow reference on a device other than the CPU.
 
     Args:
-        data: What is computed with.
-        name: "auto", or one of the backends.
-        operator: Name of the operator; any if None.
+        data: Tensor on the device to compute on.
+        name: "auto" or the name of a backend.
+        operator: Name of the operator. None: any.
 
     Raises:
-        ValueError: for a backend that does not exist, or does not serve the device of the data or the operator.
-        OSError: for one that is asked for by name and whose kernels cannot be had.
+        ValueError: If the backend does not exist, or does not support the operator or the device of the data.
+        OSError: If the kernels of a backend chosen by name are not available.
     """
     if name not in backend_names():
         raise ValueError(f"backend must be one of {', '.join(backend_names())}, got {name!r}")
     device = data.device.type
-    asked = [backend for backend in BACKENDS if name in ("auto", backend.name)]
-    able = [backend for backend in asked if backend.serves(device, operator)]
-    if not able:
-        only = " or ".join("the CPU" if kind == "cpu" else kind for kind in sorted(asked[0].devices or ()))
+    candidates = [backend for backend in BACKENDS if name in ("auto", backend.name)]
+    suitable = [backend for backend in candidates if backend.serves(device, operator)]
+    if not suitable:
+        only = " or ".join("the CPU" if kind == "cpu" else kind for kind in sorted(candidates[0].devices or ()))
         raise ValueError(f'backend "{name}" needs tensors on {only}, got {data.device}')
-    for backend in able:
+    for backend in suitable:
         reason = backend.unavailable()
         if reason is None:
             if name == "auto" and backend.is_reference and device not in ("cpu", "meta"):
@@ -137,7 +137,7 @@ def choose_backend(data: Tensor, name: str = "auto", *, operator: str | None = N
 
 
 def kernel(operator: Operator, data: Tensor, backend: str) -> Callable[..., Any]:
-    """What computes an operator for a request; no derivative may be asked of it but of the reference."""
+    """Function that computes an operator with the chosen backend. Only the reference is differentiable."""
     chosen = choose_backend(data, backend, operator=operator.name)
     return operator.reference if chosen.is_reference else operator.dispatched
 

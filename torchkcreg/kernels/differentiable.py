@@ -1,4 +1,4 @@
-"""Fast operations that are differentiable in every way that torch knows: either mode, any order, `torch.func`."""
+"""Fast operations with all derivatives of torch: forward and reverse mode, any order, `torch.func`."""
 
 from __future__ import annotations
 
@@ -10,43 +10,43 @@ from torch import Tensor
 
 
 class Kernel(Protocol):
-    """An operation with a fast gradient, and the plain torch that both have to match."""
+    """Operation with a fast result and gradient, and a reference in plain torch for both."""
 
     @property
     def forward(self) -> Callable[..., Tensor]:
-        """The result, fast; no derivative is asked of it."""
+        """Fast computation of the result; need not be differentiable."""
 
     @property
     def reference(self) -> Callable[..., Tensor]:
-        """The result in plain torch, whose derivatives torch knows."""
+        """Computation of the result in plain torch, differentiable by autograd."""
 
     def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> Sequence[Tensor | None]:
-        """Gradients to the inputs that need one, fast; no derivative is asked of them."""
+        """Fast gradients to the inputs that need one; need not be differentiable."""
 
 
 def differentiable(kernel: Kernel, *inputs: Tensor) -> Tensor:
-    """The kernel's result; its first derivatives in reverse mode are fast, all others those of the reference."""
+    """Result of the kernel. First derivatives in reverse mode are fast; all others are those of the reference."""
     return _Fast.apply(kernel, *inputs)
 
 
 def linear(images: Tensor, apply: Callable[[Tensor], Tensor], transpose: Callable[[Tensor], Tensor]) -> Tensor:
-    """A linear operation, which is its own forward derivative; in reverse mode it is the transposed one.
+    """Apply a linear operation. Its forward derivative is the operation itself, its reverse derivative the transpose.
 
     Args:
-        images: What it is applied to, one by one along the first axis.
-        apply: The operation; no derivative is asked of it.
-        transpose: The other way.
+        images: Images, independent of each other along the first axis.
+        apply: The operation; need not be differentiable.
+        transpose: The transposed operation.
     """
     return _Linear.apply(images, apply, transpose)
 
 
 def is_transformed(tensor: Tensor) -> bool:
-    """Whether a transform of `torch.func` is at work on a tensor: there are no checkpoints under one."""
+    """True inside a transform of `torch.func`, where checkpointing does not work."""
     return torch._C._functorch.is_functorch_wrapped_tensor(tensor)
 
 
 def one_by_one(apply: Callable, info: Any, in_dims: tuple, inputs: tuple) -> tuple[Any, Any]:
-    """Results of a batch, one after the other."""
+    """Apply a function to the elements of a batch, one after the other (for `vmap`)."""
     results = [
         apply(*(x if d is None else x.select(d, i) for x, d in zip(inputs, in_dims))) for i in range(info.batch_size)
     ]
@@ -57,7 +57,7 @@ def one_by_one(apply: Callable, info: Any, in_dims: tuple, inputs: tuple) -> tup
 
 
 def _pushed(function: Callable, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
-    """The forward derivative by reverse mode alone: the transpose of the transpose."""
+    """Forward derivative from reverse mode only, as the transpose of the transpose."""
     result, pull, *_ = torch.func.vjp(function, *inputs)
     zero = torch.zeros_like(result) if isinstance(result, Tensor) else tuple(torch.zeros_like(r) for r in result)
     _, push, *_ = torch.func.vjp(pull, zero)
@@ -93,7 +93,7 @@ class _Fast(torch.autograd.Function):
 
 
 class _FastGradient(torch.autograd.Function):
-    """The gradient of `_Fast`, with derivatives of its own; zeros where none is needed."""
+    """Gradient of `_Fast`, itself differentiable; zeros for inputs that need none."""
 
     @staticmethod
     def forward(kernel: Kernel, needed: Sequence[bool], gradient: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -109,8 +109,8 @@ class _FastGradient(torch.autograd.Function):
     @staticmethod
     def _reference(ctx: Any) -> Callable:
         def gradients(gradient: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-            found = torch.func.vjp(ctx.kernel.reference, *inputs)[1](gradient)
-            return tuple(g if need else torch.zeros_like(g) for g, need in zip(found, ctx.needed))
+            all_gradients = torch.func.vjp(ctx.kernel.reference, *inputs)[1](gradient)
+            return tuple(g if need else torch.zeros_like(g) for g, need in zip(all_gradients, ctx.needed))
 
         return gradients
 
@@ -124,7 +124,7 @@ class _FastGradient(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *inputs: Any) -> tuple:
-        flat = (in_dims[0], None, *in_dims[2:])  # which gradients are needed is a tuple of its own
+        flat = (in_dims[0], None, *in_dims[2:])  # `needed` is a tuple of booleans, not a tensor
         return one_by_one(_FastGradient.apply, info, flat, inputs)
 
 

@@ -1,4 +1,4 @@
-"""Finds, or builds at first use, the library of compiled kernels."""
+"""Find the library of compiled kernels, or build it at first use."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ COMPILE_FLAGS = (
 
 @functools.lru_cache(maxsize=1)
 def unavailable_reason() -> str | None:
-    """None where the compiled kernels are loaded, else why they are not. The first call loads, or compiles, them.
+    """Load or compile the kernels at the first call. Returns None, or the reason why they are not available.
 
-    A library built with the package is taken first. Without one, or where it does not load (another torch, another
-    machine), the sources are compiled into the user's cache of torch extensions. Where that fails too, a warning says
-    how to fix it, once, and the torch reference does the work.
+    A library built with the package is tried first. If there is none, or it does not load (other version of torch,
+    other machine), the sources are compiled into the user's cache of torch extensions. If that fails too, a warning
+    says once how to fix it, and the torch reference is used.
     """
     reasons = []
     for load in (_load_built, _load_compiled):
@@ -57,7 +57,7 @@ def unavailable_reason() -> str | None:
 def _failure_of(load: Callable[[], None]) -> str | None:
     try:
         load()
-    except Exception as error:  # loaders, compilers and caches fail in many ways; there is always the reference
+    except Exception as error:  # loaders, compilers and caches fail in many ways; the reference is the fallback
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return lines[0]
     return None
@@ -71,7 +71,7 @@ def _load_built() -> None:
 
 
 def _load_compiled() -> None:
-    from torch.utils import cpp_extension  # slow to import, and seldom needed
+    from torch.utils import cpp_extension  # slow to import and rarely needed
 
     sources = [PACKAGE / source for source in SOURCES]
     missing = [str(source) for source in sources if not source.is_file()]

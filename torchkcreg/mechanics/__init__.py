@@ -1,4 +1,4 @@
-"""An implant as an elastic body: stiffness from its own nodes, without a mesh; displacements, loads and stresses."""
+"""Finite-element mechanics of an implant without a body-fitted mesh: stiffness, displacements, loads, stresses."""
 
 from .body import ElasticBody
 from .carried import CarriedLoad, node_stresses

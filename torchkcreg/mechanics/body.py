@@ -1,4 +1,4 @@
-"""An implant as an elastic body: how it bends under loads that are in balance."""
+"""Implant as a free elastic body: displacements and stresses under loads in equilibrium."""
 
 from __future__ import annotations
 
@@ -19,24 +19,23 @@ from .holds import rigid_fields
 from .stiffness import stiffness_matrix
 from .stress import StressField, volumes_in_cubes
 
-_INERTIA_PITCH_MM = 1.0  # what is left over of loads is carried evenly; any even distribution will do
+_INERTIA_PITCH_MM = 1.0  # inertia only balances the loads' resultant; a coarse distribution suffices
 
 
 class ElasticBody:
     """A free elastic body, its stiffness assembled and factorised once.
 
-    Loads need not be in balance: what is left over is carried by the body's inertia (as if it were accelerated, which
-    loads that do balance each other cancel). Displacements are those without the body's motion as a whole. They are
-    small: linear in the loads.
+    Loads need not be in equilibrium: their resultant is balanced by inertia forces of the body (inertia relief), which
+    vanish for loads in equilibrium. Displacements exclude rigid motion of the body and are small, linear in the loads.
 
     Args:
-        cloud: The implant, in its frame; on nodes of a tenth of its thickness or less.
-        constants: Of its alloy.
-        edge: Of the cubes that carry the displacements, mm; see `edge_for` if None.
+        cloud: The implant, in its frame, with a node spacing of at most a tenth of its thickness.
+        constants: Elastic constants of its alloy.
+        edge: Edge of the hexahedra, mm; `edge_for(cloud)` if None.
 
     Attributes:
-        hexahedra: The cubes; displacements are given at their nodes, (..., N, 3), in the implant's axes, mm.
-        filled: How much of the implant is in each cube, shape (E,), mm^3.
+        hexahedra: The elements (cubes); displacements are given at their nodes, (..., N, 3), in the implant's axes, mm.
+        filled: Metal volume in each cube, shape (E,), mm^3.
         stiffness: Sparse matrix (3 N, 3 N), N/mm, in the lattice's axes.
     """
 
@@ -57,11 +56,11 @@ class ElasticBody:
         self._factor = cholesky_banded(_banded(self.stiffness, self._pinned), lower=True, overwrite_ab=True)
 
     def nodal_loads(self, points: Tensor, forces: Tensor) -> Tensor:
-        """Forces (..., P, 3) at points (P, 3) as loads (..., N, 3) at the hexahedra's nodes; all in the lattice's axes.
+        """Nodal loads (..., N, 3) equivalent to forces (..., P, 3) at points (P, 3); all in the lattice's axes.
 
         Args:
-            points: In the implant's frame.
-            forces: N.
+            points: Points in the implant's frame, mm.
+            forces: Forces in N.
         """
         cube, inside = self.hexahedra.locate(points)
         values, _ = self.hexahedra.shape_functions(inside)
@@ -71,35 +70,35 @@ class ElasticBody:
         return loads.index_add_(-2, nodes, spread)
 
     def response(self, points: Sequence[Tensor], forces: Sequence[Tensor]) -> Tensor:
-        """Displacements (L, N, 3) of the hexahedra's nodes under L loads, each of its own, in the implant's axes.
+        """Displacements (L, N, 3) of the hexahedra's nodes under each of L loads, in the implant's axes.
 
         Args:
-            points: Where each load acts, (P, 3) in the implant's frame.
-            forces: Its forces there, (P, 3) in the implant's axes, N.
+            points: For each load, its points of application (P, 3) in the implant's frame.
+            forces: For each load, its forces (P, 3) there, in the implant's axes, N.
         """
         pairs = zip(points, forces, strict=True)
-        loads = torch.stack([self.nodal_loads(where, force.double() @ self._turn) for where, force in pairs])
+        loads = torch.stack([self.nodal_loads(places, force.double() @ self._turn) for places, force in pairs])
         surplus = torch.einsum("lni,kni->lk", loads, self._rigid)
         loads = loads - torch.einsum("lk,kni->lni", torch.linalg.solve(self._gram.mT, surplus.mT).mT, self._inertia)
-        right = loads.flatten(1).cpu().numpy().T.copy()
-        right[self._pinned] = 0.0
-        solved = torch.from_numpy(cho_solve_banded((self._factor, True), right).T).to(loads)
+        right_side = loads.flatten(1).cpu().numpy().T.copy()
+        right_side[self._pinned] = 0.0
+        solved = torch.from_numpy(cho_solve_banded((self._factor, True), right_side).T).to(loads)
         moved = solved.unflatten(-1, (-1, 3))
         along = torch.einsum("lni,kni->lk", moved, self._inertia)
         moved = moved - torch.einsum("lk,kni->lni", torch.linalg.solve(self._gram, along.mT).mT, self._rigid)
         return moved @ self._turn.mT
 
     def displacement(self, points: Tensor, nodal: Tensor) -> Tensor:
-        """Displacements (L, P, 3) of points (P, 3) of the implant's frame, of those (L, N, 3) of the nodes, mm."""
+        """Displacements (L, P, 3) at points (P, 3) in the implant's frame, from those (L, N, 3) at the nodes, mm."""
         return interpolated(self.hexahedra, nodal, *self.hexahedra.locate(points))
 
     def stress(self, points: Tensor, nodal: Tensor) -> Tensor:
-        """Stresses (L, P, 3, 3) at points of the implant, N/mm^2, in its axes; see `StressField`."""
+        """Stresses (L, P, 3, 3) at points (P, 3) of the implant, N/mm^2, in its axes; see `StressField`."""
         return StressField.of(self.hexahedra, self.filled, self.constants, nodal).at(points)
 
 
 def _pinned(positions: Tensor) -> list[int]:
-    """Numbers of six displacements that hold a body in its place without straining it: of three nodes far apart."""
+    """Indices of six degrees of freedom, at three nodes far apart, that fix a body without straining it."""
     spread = positions.amax(0) - positions.amin(0)
     first = int((positions - positions.amin(0)).norm(dim=-1).argmin())
     away = positions - positions[first]
@@ -114,11 +113,11 @@ def _pinned(positions: Tensor) -> list[int]:
 
 
 def _banded(matrix: csr_array, pinned: Sequence[int]) -> np.ndarray:
-    """The lower half of a symmetric matrix by its diagonals (bandwidth, n), pinned displacements taken out."""
+    """Lower triangle of a symmetric matrix in banded storage (bandwidth, n), with pinned displacements eliminated."""
     entries = matrix.tocoo()
     rows, columns = entries.coords
-    kept = rows >= columns
-    rows, columns, values = rows[kept], columns[kept], entries.data[kept].copy()
+    lower = rows >= columns
+    rows, columns, values = rows[lower], columns[lower], entries.data[lower].copy()
     values[np.isin(rows, pinned) | np.isin(columns, pinned)] = 0.0
     band = np.zeros((int((rows - columns).max()) + 1, matrix.shape[0]))
     band[rows - columns, columns] = values

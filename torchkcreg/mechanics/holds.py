@@ -1,4 +1,4 @@
-"""Where an implant may be held: its holes, or patches along one that has none."""
+"""Holds: places where an implant may be fixed and loaded (its holes, or patches along it), and unit loads there."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torch import Tensor
 
 from torchkcreg.implant import Hole, ImplantPointCloud
 
-_RIM_MM = 1.5  # around a hole's wall: what a screw's head presses on
-_JOINED = 2.2  # radii between centres: round holes that open into each other
-_SPACING = 3.0  # of patches, in widths of the implant's cross-section; at least
+_RIM_MM = 1.5  # width of the rim around a hole that a screw's head presses on
+_JOINED = 2.2  # in radii: distance of the centres of round holes that open into each other
+_SPACING = 3.0  # least spacing of patches, in widths of the implant's cross-section
 _MOST_PATCHES = 12
 _FEWEST_HOLES = 3
-_SPANNED = 0.5  # of the implant's length, by the holes that hold it
+_SPANNED = 0.5  # least share of the implant's length that its holes must span
 
 
 def rigid_fields(positions: Tensor) -> Tensor:
-    """Displacements (6, N, 3) of positions (N, 3) by a unit shift along each axis, and a unit small turn about each."""
+    """Displacements (6, N, 3) of positions (N, 3) for a unit shift along and a small unit rotation about each axis."""
     axes = torch.eye(3, dtype=positions.dtype, device=positions.device)
     shifts = axes[:, None].expand(3, len(positions), 3)
     turns = torch.linalg.cross(axes[:, None].expand_as(shifts), positions[None].expand_as(shifts))
@@ -32,11 +32,11 @@ class Hold:
     """A place where an implant may be held and loaded.
 
     Attributes:
-        name: How results refer to it.
-        center: Where its force acts and about what its moment turns, (3,) in the implant's frame, mm.
-        radius: Nodes within it belong to the hold, mm.
-        axis: Direction of a hole's axis: the radius is meant across it then, and its half depth along it.
-        half_depth: mm.
+        name: Its name in results.
+        center: Point where its force acts and about which its moment is taken, (3,) in the implant's frame, mm.
+        radius: Nodes within this distance belong to the hold, mm.
+        axis: Direction of the axis, for a hole. The radius is then measured from the axis, the half depth along it.
+        half_depth: Half the depth of a hole, mm.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Hold:
     half_depth: float = 0.0
 
     def nodes(self, points: Tensor) -> Tensor:
-        """Numbers of the nodes (N, 3) that belong to the hold; the nearest where none is near enough."""
+        """Indices of the nodes (N, 3) that belong to the hold; the three nearest if fewer than three do."""
         away = points.double() - points.new_tensor(self.center, dtype=torch.float64)
         distance = away.norm(dim=-1)
         if self.axis is None:
@@ -55,19 +55,21 @@ class Hold:
             along = away @ points.new_tensor(self.axis, dtype=torch.float64)
             across = (distance.square() - along.square()).clamp_min(0).sqrt()
             inside = (across <= self.radius) & (along.abs() <= self.half_depth + _RIM_MM)
-        found = inside.nonzero().flatten()
-        return found if len(found) >= 3 else distance.argsort()[:3]
+        members = inside.nonzero().flatten()
+        return members if len(members) >= 3 else distance.argsort()[:3]
 
 
 def holds_of(cloud: ImplantPointCloud, holes: Sequence[Hole] = ()) -> list[Hold]:
-    """Where an implant may be held: its holes, or patches along it where holes leave more than half of it free."""
+    """Holds of an implant: its holes, or patches along it if the holes are few or span less than half its length."""
     middle, axes, extents = (x.double() for x in cloud.principal_axes())
     along, length = axes[-1], float(extents[-1])
     places: list[list[Hole]] = []
     for hole in holes:
-        joined = [p for p in places if min(np.linalg.norm(h.center - hole.center) for h in p) < _JOINED * hole.radius]
-        if joined:
-            joined[0].append(hole)
+        overlapping = [
+            p for p in places if min(np.linalg.norm(h.center - hole.center) for h in p) < _JOINED * hole.radius
+        ]
+        if overlapping:
+            overlapping[0].append(hole)
         else:
             places.append([hole])
     holds = [_at(number, place) for number, place in enumerate(places, start=1)]
@@ -78,7 +80,7 @@ def holds_of(cloud: ImplantPointCloud, holes: Sequence[Hole] = ()) -> list[Hold]
 
 
 def _at(number: int, holes: Sequence[Hole]) -> Hold:
-    """The place of one hole, or of those that a combination hole is made of."""
+    """Hold of one hole, or of the holes of a combination hole."""
     center, first = np.mean([hole.center for hole in holes], axis=0), holes[0]
     reach = max(float(np.linalg.norm(hole.center - center)) + hole.radius for hole in holes) + _RIM_MM
     middle, axis = (tuple(float(x) for x in vector) for vector in (center, first.axis))
@@ -93,29 +95,29 @@ def _patches(cloud: ImplantPointCloud, middle: Tensor, along: Tensor, length: fl
     spacing = (high - low) / number
     holds = []
     for index in range(number):
-        here = (height - (low + (index + 0.5) * spacing)).abs() <= spacing / 2
-        center = points[here if bool(here.any()) else slice(None)].mean(0)
+        in_patch = (height - (low + (index + 0.5) * spacing)).abs() <= spacing / 2
+        center = points[in_patch if bool(in_patch.any()) else slice(None)].mean(0)
         holds.append(Hold(f"patch {index + 1}", tuple(center.tolist()), min(width, spacing) / 2))
     return holds
 
 
 def unit_loads(cloud: ImplantPointCloud, holds: Sequence[Hold]) -> tuple[list[Tensor], list[Tensor]]:
-    """Where each of six unit loads of each hold acts, (P, 3), and its forces there: 1 N along, 1 N mm about each axis.
+    """Points (P, 3) and forces (P, 3) of six unit loads per hold: 1 N along and 1 N mm about each axis.
 
-    The metal of a hold moves nearly as one: forces are spread over it as those of a rigid body, moments about the
-    hold's centre.
+    The metal of a hold moves almost rigidly, so forces are distributed over it like those on a rigid body. Moments are
+    about the hold's centre.
     """
-    where, forces = [], []
+    places, forces = [], []
     for hold in holds:
-        chosen = hold.nodes(cloud.points)
-        points, volumes = cloud.points[chosen].double(), cloud.volumes[chosen].double()[:, None]
+        nodes = hold.nodes(cloud.points)
+        points, volumes = cloud.points[nodes].double(), cloud.volumes[nodes].double()[:, None]
         arms = points - points.new_tensor(hold.center)
         spread = rigid_fields(arms) * volumes
-        wrench = torch.stack([_wrench(arms, field) for field in spread], dim=-1)  # (6, 6): what each field amounts to
+        wrench = torch.stack([_wrench(arms, field) for field in spread], dim=-1)  # (6, 6): resultant of each field
         loads = torch.einsum("kl,kpi->lpi", torch.linalg.inv(wrench), spread)
-        where += [points] * 6
+        places += [points] * 6
         forces += list(loads)
-    return where, forces
+    return places, forces
 
 
 def _wrench(arms: Tensor, forces: Tensor) -> Tensor:

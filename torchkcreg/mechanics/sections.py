@@ -1,4 +1,4 @@
-"""Cross-sections along an implant: how they move when it bends, linearly and with finite rotations."""
+"""Motion of cross-sections along a bending implant, linear and with finite rotations."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from torchkcreg.implant import ImplantPointCloud
 
 @dataclass(frozen=True, eq=False)
 class Sections:
-    """Stations along an implant's longest axis; between two of them what belongs to both is blended linearly.
+    """Stations along an implant's longest axis, with linear interpolation between neighbouring stations.
 
     Attributes:
         axis: Unit vector (3,) in the implant's frame.
-        heights: Of the S stations along it, ascending, evenly spaced, mm.
-        centers: Of the metal about each, (S, 3) in the implant's frame, mm.
+        heights: Positions (S,) of the stations along the axis, ascending, evenly spaced, mm.
+        centers: Centres (S, 3) of the metal around each station, in the implant's frame, mm.
     """
 
     axis: Tensor
@@ -27,25 +27,25 @@ class Sections:
 
     @classmethod
     def along(cls, cloud: ImplantPointCloud, number: int) -> Sections:
-        """So many stations from one end of an implant to the other."""
+        """The given number of stations from one end of an implant to the other."""
         _, axes, _ = cloud.principal_axes()
         axis = axes[-1].double()
         points, volumes = cloud.points.double(), cloud.volumes.double()
         height = points @ axis
         low, high = height.aminmax()
         heights = low + (high - low) * torch.linspace(0, 1, number, dtype=torch.float64, device=axis.device)
-        bare = cls(axis, heights, points.new_zeros(number, 3))
-        share = bare.weights(points) * volumes[:, None]
+        without_centers = cls(axis, heights, points.new_zeros(number, 3))
+        share = without_centers.weights(points) * volumes[:, None]
         return cls(axis, heights, share.T @ points / share.sum(0)[:, None])
 
     def weights(self, points: Tensor) -> Tensor:
-        """To how much points (N, 3) belong to each station, (N, S), sums of one; beyond the ends to the last one."""
+        """Interpolation weights (N, S) of points (N, 3); rows sum to one. Beyond an end its station has weight one."""
         place = (points.double() @ self.axis - self.heights[0]) / (self.heights[1] - self.heights[0])
         stations = torch.arange(len(self.heights), dtype=place.dtype, device=place.device)
         return (1 - (place.clamp(0, len(self.heights) - 1)[:, None] - stations).abs()).clamp_min(0)
 
     def motions(self, points: Tensor, volumes: Tensor, fields: Tensor) -> tuple[Tensor, Tensor]:
-        """Shifts and small turns (L, S, 3) of the stations that fit displacements (L, N, 3) of points (N, 3) best.
+        """Shifts and small rotations (L, S, 3) of the stations that best fit displacements (L, N, 3) of points (N, 3).
 
         Shifts are those of the stations' centres.
         """
@@ -64,7 +64,7 @@ class Sections:
         return torch.stack(shifts, dim=1), torch.stack(turns, dim=1)
 
     def blended(self, points: Tensor, shifts: Tensor, turns: Tensor) -> Tensor:
-        """Displacements (L, N, 3) of points (N, 3) under small motions (L, S, 3) of the stations."""
+        """Displacements (L, N, 3) of points (N, 3), interpolated from small motions (L, S, 3) of the stations."""
         weights = self.weights(points)
         return (
             torch.einsum("ns,lsi->lni", weights, shifts)
@@ -77,20 +77,20 @@ class Sections:
     def chained(self, shifts: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
         """Rotations (K, S, 3, 3) and centres (K, S, 3) of the stations under finite motions.
 
-        What a station turns and shifts against its neighbour is small, and exactly as small where the implant has
-        turned far: the differences of the linear motions are strains in the implant's own frame, and are integrated
-        along it from the middle station on (geometrically exact beam, Simo 1985).
+        Motions of a station relative to its neighbour are small even where the implant has rotated far. The differences
+        of the linear motions are therefore taken as strains in the implant's local frame, and are integrated along it
+        from the middle station (geometrically exact beam, Simo 1985).
 
         Args:
-            shifts: Linear motions of the stations, shape (K, S, 3).
-            turns: Their small rotation vectors, shape (K, S, 3).
+            shifts: Linear shifts of the stations, shape (K, S, 3), mm.
+            turns: Small rotation vectors of the stations, shape (K, S, 3).
         """
         spans = self.centers.diff(dim=0)
         bends = turns.diff(dim=1)
         between = (turns[:, 1:] + turns[:, :-1]) / 2
         stretched = spans + shifts.diff(dim=1) - torch.linalg.cross(between, spans.expand_as(between), dim=-1)
         whole, half = rotation_from_vector(bends), rotation_from_vector(bends / 2)
-        steps = (half @ stretched[..., None])[..., 0]  # from a station to the next, as the first one sees it
+        steps = (half @ stretched[..., None])[..., 0]  # from a station to the next, in the frame of the former
         middle = len(self.heights) // 2
         rotations = {middle: rotation_from_vector(turns[:, middle])}
         places = {middle: self.centers[middle] + shifts[:, middle]}

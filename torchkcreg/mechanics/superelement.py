@@ -1,4 +1,7 @@
-"""An elastic implant condensed to the loads at its holds: a few dozen ways to bend, softest first."""
+"""Superelement: an elastic implant condensed to the loads at its holds, with a few dozen bending modes, softest first.
+
+Also the prior of these loads.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +24,16 @@ from .stress import StressField
 
 _STATIONS = 24
 _NUMBERS = ("filled", "loads", "expected", "stiff", "shifts", "turns")
-_PITCH_MM = 0.5  # of nodes that tell the motion of a section
+_PITCH_MM = 0.5  # node spacing from which the motion of a section is computed
 
 
 @dataclass(frozen=True)
 class LoadPrior:
-    """How strong loads at a hold are expected to be, standard deviations.
+    """Standard deviations of the loads expected at a hold.
 
     Attributes:
-        force: Along each axis, N.
-        moment: About each axis, N mm.
+        force: Force along each axis, N.
+        moment: Moment about each axis, N mm.
     """
 
     force: float = 200.0
@@ -39,25 +42,26 @@ class LoadPrior:
 
 @dataclass(frozen=True, eq=False)
 class Superelement:
-    """Ways in which an implant bends under loads at its holds that are in balance.
+    """Bending modes of an implant under loads in equilibrium at its holds.
 
-    Static condensation: each way is the response to loads at the holds, so all between them is free. Ways are
-    independent under the prior of loads, and ordered by how far they then move the implant.
+    Static condensation: each mode is the response to loads at the holds, and no load acts between them. The modes are
+    independent under the prior of the loads, and ordered by their expected displacement of the implant.
 
     Attributes:
-        hexahedra: That carry displacements.
+        hexahedra: Hexahedra whose nodes carry the displacements.
         filled: Volume of metal in each, (E,), mm^3.
-        constants: Of the alloy.
-        holds: The H places.
-        sections: Along the implant.
-        loads: Forces and moments at the holds of each way at an amount of one, (A, H, 6), N and N mm, in the implant's
-            axes. An amount of one moves the implant by 1 mm, root mean square.
-        expected: Amounts (A,) that the prior expects, standard deviations, mm.
-        prior: How strong those are.
-        stiff: Loads (B, H, 6), of one standard deviation, that move the implant less than images can tell.
-        nodal: Displacements (A, N, 3) of the hexahedra's nodes at an amount of one, mm.
-        shifts: Of the sections, (A, S, 3), mm.
-        turns: Of the sections, (A, S, 3), radians.
+        constants: Elastic constants of the alloy.
+        holds: The H holds.
+        sections: Cross-sections along the implant.
+        loads: Forces and moments at the holds for an amount of one of each mode, (A, H, 6), N and N mm, in the
+            implant's axes. An amount of one moves the implant by 1 mm, root mean square.
+        expected: Standard deviations (A,) of the amounts under the prior, mm.
+        prior: Prior of the loads at the holds.
+        stiff: Stiff modes: loads (B, H, 6) of one standard deviation that move the implant less than is visible in
+            images.
+        nodal: Displacements (A, N, 3) of the hexahedra's nodes for an amount of one, mm.
+        shifts: Shifts (A, S, 3) of the sections for an amount of one, mm.
+        turns: Small rotation vectors (A, S, 3) of the sections for an amount of one, radians.
     """
 
     hexahedra: Hexahedra
@@ -83,90 +87,93 @@ class Superelement:
         prior: LoadPrior | None = None,
         negligible_mm: float = 1e-3,
     ) -> Superelement:
-        """Of an implant and where it may be held.
+        """Superelement of an implant and its holds.
 
         Args:
             cloud: The implant.
-            constants: Of its alloy.
-            holds: At least two.
-            prior: Of the loads.
-            negligible_mm: Ways that the prior expects to move the implant less are left out.
+            constants: Elastic constants of its alloy.
+            holds: At least two holds.
+            prior: Prior of the loads; default values if None.
+            negligible_mm: Modes with a smaller expected displacement are counted as stiff modes.
 
         Raises:
-            ValueError: If there are fewer than two holds: no loads could be in balance.
+            ValueError: If there are fewer than two holds, since no loads could then be in equilibrium.
         """
         if len(holds) < 2:
             raise ValueError(f"an implant that bends is held in two places or more, got {len(holds)}")
         prior = prior or LoadPrior()
         body = ElasticBody(cloud, constants)
-        units = body.response(*unit_loads(cloud, holds))
-        scale = units.new_tensor([prior.force] * 3 + [prior.moment] * 3).repeat(len(holds))
+        unit_responses = body.response(*unit_loads(cloud, holds))
+        scale = unit_responses.new_tensor([prior.force] * 3 + [prior.moment] * 3).repeat(len(holds))
         balanced = _balanced(holds, scale)  # (6 H - 6, 6 H), orthonormal under the prior
         coarse = cloud.coarsened_to(_PITCH_MM)
         points, volumes = coarse.points.double(), coarse.volumes.double()
-        moved = body.displacement(points, units)
+        moved = body.displacement(points, unit_responses)
         flat = (moved * (volumes / volumes.sum()).sqrt()[:, None]).flatten(1)
         mapped = balanced * scale
         values, vectors = torch.linalg.eigh(mapped @ (flat @ flat.T) @ mapped.T)
-        values, ways = values.flip(0).clamp_min(0).sqrt(), vectors.flip(1).T @ mapped
-        ways = ways * _senses(ways @ moved.flatten(1))
-        kept = int((values > negligible_mm).sum().clamp_min(1))
-        ways, stiff, expected = ways[:kept] / values[:kept, None], ways[kept:], values[:kept]
+        values, modes = values.flip(0).clamp_min(0).sqrt(), vectors.flip(1).T @ mapped
+        modes = modes * _senses(modes @ moved.flatten(1))
+        num_modes = int((values > negligible_mm).sum().clamp_min(1))
+        modes, stiff, expected = modes[:num_modes] / values[:num_modes, None], modes[num_modes:], values[:num_modes]
         sections = Sections.along(coarse, _STATIONS)
-        shifts, turns = sections.motions(points, volumes, torch.einsum("al,lni->ani", ways, moved))
+        shifts, turns = sections.motions(points, volumes, torch.einsum("al,lni->ani", modes, moved))
         return cls(
             body.hexahedra,
             body.filled,
             constants,
             tuple(holds),
             sections,
-            ways.unflatten(-1, (-1, 6)),
+            modes.unflatten(-1, (-1, 6)),
             expected,
             prior,
             stiff.unflatten(-1, (-1, 6)),
-            torch.einsum("al,lni->ani", ways, units).float().double(),  # as files keep them
+            torch.einsum("al,lni->ani", modes, unit_responses).float().double(),  # single precision, as in files
             shifts,
             turns,
         )
 
     @property
     def num_amounts(self) -> int:
-        """A."""
+        """Number of modes A."""
         return len(self.expected)
 
     def remainder(self, points: Tensor, amounts: Tensor) -> Tensor:
-        """What of linear displacements (K, P, 3) at points (P, 3) the motion of the sections leaves, mm.
+        """Linear displacements (K, P, 3) at points (P, 3) minus the motion of the sections, mm.
 
-        Points beside the implant have that of the nearest cube's edge.
+        Points outside all cubes get the value at the nearest cube's surface.
 
         Args:
-            points: In the implant's frame.
-            amounts: Shape (K, A).
+            points: Points in the implant's frame.
+            amounts: Amounts of the modes, shape (K, A), mm.
         """
         points, amounts = points.double(), amounts.to(self.nodal)
-        there, whole = self._interpolated(points, amounts)
-        shifts, turns = (torch.einsum("ka,asi->ksi", amounts, ways) for ways in (self.shifts, self.turns))
-        return whole - self.sections.blended(there, shifts, turns)
+        places, linear = self._interpolated(points, amounts)
+        shifts, turns = (torch.einsum("ka,asi->ksi", amounts, motions) for motions in (self.shifts, self.turns))
+        return linear - self.sections.blended(places, shifts, turns)
 
     def linear(self, points: Tensor, amounts: Tensor) -> Tensor:
-        """Linear displacements (K, P, 3) for amounts (K, A) at points (P, 3), mm; beside it, of the nearest edge."""
+        """Linear displacements (K, P, 3) for amounts (K, A) at points (P, 3), mm.
+
+        Points outside all cubes get the value at the nearest cube's surface.
+        """
         return self._interpolated(points.double(), amounts.to(self.nodal))[1]
 
     def _interpolated(self, points: Tensor, amounts: Tensor) -> tuple[Tensor, Tensor]:
-        """The places (P, 3) in the cubes nearest to points, and the linear displacements (K, P, 3) there."""
+        """Points (P, 3) moved to the nearest place inside their cubes, and the linear displacements (K, P, 3) there."""
         cube, inside = self.hexahedra.locate(points)
-        held = inside.clamp(-1, 1)
-        there = points + (held - inside) @ self.hexahedra.frame[:3, :3].mT * (self.hexahedra.edge / 2)
+        clamped = inside.clamp(-1, 1)
+        places = points + (clamped - inside) @ self.hexahedra.frame[:3, :3].mT * (self.hexahedra.edge / 2)
         nodal = torch.einsum("ka,ani->kni", amounts, self.nodal)
-        return there, interpolated(self.hexahedra, nodal, cube, held)
+        return places, interpolated(self.hexahedra, nodal, cube, clamped)
 
     def stress(self, points: Tensor, amounts: Tensor) -> Tensor:
-        """Stresses (P, 3, 3) at points (P, 3) of the undeformed implant, N/mm^2, in its axes."""
+        """Stresses (P, 3, 3) for amounts (A,) at points (P, 3) of the undeformed implant, N/mm^2, in its axes."""
         nodal = torch.einsum("a,ani->ni", amounts.to(self.nodal), self.nodal)[None]
         return StressField.of(self.hexahedra, self.filled, self.constants, nodal).at(points)[0]
 
     def to(self, device: torch.device | str) -> Superelement:
-        """On a device."""
+        """Copy on a device."""
         moved = {f.name: _moved(getattr(self, f.name), device) for f in fields(self)}
         return replace(self, **moved)
 
@@ -185,10 +192,10 @@ class Superelement:
 
     @classmethod
     def from_dict(cls, content: Any) -> Superelement:
-        """What :meth:`to_dict` gave.
+        """Inverse of `to_dict`.
 
         Raises:
-            ValueError: A key is missing or malformed; the message names it.
+            ValueError: If a key is missing or malformed; the message names it.
         """
         parts = ("hexahedra", "constants", "prior", "holds", "sections")
         require_keys(content, (*parts, *_NUMBERS, "nodal"), " of a superelement")
@@ -216,10 +223,10 @@ def _with_tuples(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _senses(displacements: Tensor) -> Tensor:
-    """1 or -1 (A, 1) for each of displacements (A, N): where it is largest it shall be positive.
+    """Signs (A, 1) that make the largest component of each row of displacements (A, N) positive.
 
-    Eigenvectors have no sense of their own, and libraries and processors give them one or the other. Of equal ones, as
-    the ends of a symmetric implant have, a later one counts as larger.
+    The sign of an eigenvector is arbitrary and differs between libraries and processors. Among equally large components
+    (as at the ends of a symmetric implant) a later one counts as larger.
     """
     rising = torch.linspace(1.0, 1.01, displacements.shape[1], dtype=displacements.dtype, device=displacements.device)
     largest = (displacements.abs() * rising).argmax(1, keepdim=True)
@@ -227,18 +234,18 @@ def _senses(displacements: Tensor) -> Tensor:
 
 
 def _balanced(holds: Sequence[Hold], scale: Tensor) -> Tensor:
-    """Orthonormal combinations (6 H - 6, 6 H) of scaled loads at holds whose force and moment vanish."""
+    """Orthonormal combinations (6 H - 6, 6 H) of scaled loads at holds with zero resultant force and moment."""
     places = scale.new_tensor([h.center for h in holds])
     places = (places - places.mean(0)).to(scale)
-    same = torch.eye(3, dtype=scale.dtype, device=scale.device)
+    identity = torch.eye(3, dtype=scale.dtype, device=scale.device)
     rows = []
     for place in places:
-        arm = torch.linalg.cross(place.expand(3, 3), same)  # moments of unit forces there, one a row
-        forces = torch.cat([same, torch.zeros_like(same)], dim=1)
-        rows.append(torch.cat([forces, torch.cat([arm.mT, same], dim=1)]))
+        arm = torch.linalg.cross(place.expand(3, 3), identity)  # moments of unit forces there, in rows
+        forces = torch.cat([identity, torch.zeros_like(identity)], dim=1)
+        rows.append(torch.cat([forces, torch.cat([arm.mT, identity], dim=1)]))
     balance = torch.cat(rows, dim=1) * scale  # (6, 6 H)
-    _, _, right = torch.linalg.svd(balance / balance.norm(dim=1, keepdim=True), full_matrices=True)
-    return right[6:]
+    _, _, row_space = torch.linalg.svd(balance / balance.norm(dim=1, keepdim=True), full_matrices=True)
+    return row_space[6:]
 
 
 def _moved(part: Any, device: torch.device | str) -> Any:
@@ -251,13 +258,13 @@ def _moved(part: Any, device: torch.device | str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class ExpectedLoads:
-    """A prior of loads, some holds of which carry less than others, in terms of a superelement's amounts.
+    """Prior of the loads in terms of a superelement's amounts; some holds may be expected to carry less than others.
 
     Attributes:
-        precision: Of the amounts, (A, A), 1/mm^2: ``a^T precision a`` is the least sum of squared loads, in standard
-            deviations, that bends the implant by amounts a.
-        followed: Of the stiff ways, (B, A): how much of them comes with an amount.
-        spread: Covariance (B, B) of the stiff ways about that.
+        precision: Precision (A, A) of the amounts, 1/mm^2: `a^T precision a` is the least sum of squared loads, in
+            standard deviations, that bends the implant by amounts a.
+        followed: Regression (B, A) of the stiff modes on the amounts: their expected amounts per unit amount.
+        spread: Covariance (B, B) of the stiff modes given the amounts.
     """
 
     precision: Tensor
@@ -266,37 +273,36 @@ class ExpectedLoads:
 
     @classmethod
     def of(cls, element: Superelement, shares: Tensor | None = None) -> ExpectedLoads:
-        """Of an implant.
+        """Prior of the loads of an implant.
 
         Args:
-            element: The implant.
-            shares: How strong loads of each hold are against what the superelement's prior expects, (H,); all of them
-                that when None.
+            element: Superelement of the implant.
+            shares: Strength (H,) of the loads at each hold relative to the superelement's prior; all one if None.
         """
-        number = element.num_amounts
+        num_amounts = element.num_amounts
         scale = element.loads.new_tensor([element.prior.force] * 3 + [element.prior.moment] * 3)
         strengths = scale.expand(len(element.holds), 6) * (1.0 if shares is None else shares.to(scale)[:, None])
-        ways = (torch.cat([element.loads, element.stiff]) / strengths).flatten(1)
-        whole = ways @ ways.T
-        stiff, mixed = whole[number:, number:], whole[number:, :number]
+        scaled_loads = (torch.cat([element.loads, element.stiff]) / strengths).flatten(1)
+        gram = scaled_loads @ scaled_loads.T
+        stiff, mixed = gram[num_amounts:, num_amounts:], gram[num_amounts:, :num_amounts]
         spread = torch.linalg.inv(stiff)
         followed = -spread @ mixed
-        return cls(whole[:number, :number] + mixed.T @ followed, followed, spread)
+        return cls(gram[:num_amounts, :num_amounts] + mixed.T @ followed, followed, spread)
 
     def loads_of(self, element: Superelement) -> Tensor:
-        """Loads (A, H, 6) that are likeliest at an amount of one, those of the stiff ways included, N and N mm."""
+        """Most likely loads (A, H, 6) for an amount of one of each mode, including those of stiff modes, N and N mm."""
         return element.loads + torch.einsum("ba,bhk->ahk", self.followed, element.stiff)
 
     @property
     def covariance(self) -> Tensor:
-        """Of the amounts that are expected, (A, A), mm^2."""
+        """Prior covariance (A, A) of the amounts, mm^2."""
         return torch.linalg.inv(self.precision)
 
 
 def shares_of_holds(element: Superelement, heads: Sequence[Tensor] | Tensor, unused: float) -> Tensor:
-    """Shares (H,) of holds where an implant is fixed: one at the nearest hold of each head (C, 3), else less.
+    """Relative strength (H,) of the loads at each hold: one at the hold nearest to each head (C, 3), else `unused`.
 
-    All are one where heads are at fewer than two holds: no loads could be in balance.
+    All are one if the heads are at fewer than two holds, since no loads could then be in equilibrium.
     """
     centers = element.loads.new_tensor([hold.center for hold in element.holds])
     used = {int((centers - head.to(centers)).norm(dim=-1).argmin()) for head in heads}

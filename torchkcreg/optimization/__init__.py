@@ -1,5 +1,6 @@
-"""Optimisers behind ask and tell, and the names that stages call them by. One of your own is a class like these, and a
-line here or an argument of `register`.
+"""Optimisers with an ask-and-tell interface, and the names by which stages select them.
+
+To use your own, derive a class from `Optimizer` and add it to `OPTIMIZERS`, or pass it to `register`.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Adam, a step at a time."""
+"""Adam, step by step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .optimizer import Optimizer, Options, Problem
 
 
 class Adam(Optimizer):
-    """Adam (Kingma & Ba 2015) with a cosine-shaped learning rate; its best is the best vector it saw."""
+    """Adam (Kingma & Ba 2015) with a cosine-shaped learning rate; returns the best vector visited."""
 
     uses_losses = False
 
@@ -26,11 +26,11 @@ class Adam(Optimizer):
         )
 
     def ask(self) -> Tensor:
-        """Where it is."""
+        """Current vector, as a batch of one."""
         return self._parameters.detach().clone()[None]
 
     def tell(self, candidates: Tensor, losses: Tensor) -> None:
-        """A step downhill."""
+        """Take one Adam step with the gradient of the loss. `losses` are not used."""
         before = candidates[0]
         loss, self._parameters.grad = self.problem.loss_and_gradient(before)
         if loss < self._loss:
@@ -43,11 +43,11 @@ class Adam(Optimizer):
         self._advance(self._loss, step, end=step < self.stage.tolerance)
 
     def best(self) -> Tensor:
-        """The vector of least loss."""
+        """Visited vector with the lowest loss."""
         return self._best
 
     def state_dict(self) -> dict[str, Any]:
-        """Vectors, moments and learning rate."""
+        """Vectors, moments and learning rate, for a checkpoint."""
         return {
             "parameters": self._parameters.detach().clone(),
             "best": self._best.clone(),
@@ -58,7 +58,7 @@ class Adam(Optimizer):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """All of them."""
+        """Restore a checkpoint."""
         with torch.no_grad():
             self._parameters.copy_(state["parameters"])
         self._best, self._loss = state["best"].clone(), state["loss"]

@@ -1,4 +1,4 @@
-"""CMA-ES, a generation at a time."""
+"""CMA-ES, generation by generation."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .optimizer import Optimizer, Options, Problem
 
 
 class CMAES(Optimizer):
-    """Covariance matrix adaptation evolution strategy (library ``cma``); a whole generation is one batch."""
+    """Covariance matrix adaptation evolution strategy (library `cma`); each generation is one batch."""
 
     def __init__(self, problem: Problem, stage: Options, seed: int) -> None:
-        import cma  # late: it brings a plotting library along, and few registrations need it
+        import cma  # imported here because it loads a plotting library and few registrations need it
 
         super().__init__(problem, stage, seed)
         options = {
             "popsize": stage.population,
             "maxiter": stage.iterations,
-            "seed": math.nan,  # which leaves NumPy's global generator alone
+            "seed": math.nan,  # NaN: NumPy's global generator is not seeded
             "randn": np.random.RandomState(seed + 1).randn,
             "verbose": -9,
             "verb_log": 0,
@@ -36,12 +36,12 @@ class CMAES(Optimizer):
         self._asked: list[np.ndarray] = []
 
     def ask(self) -> Tensor:
-        """A generation."""
+        """Candidates of a new generation."""
         self._asked = self._strategy.ask()
         return self._bounded(np.stack(self._asked))
 
     def tell(self, candidates: Tensor, losses: Tensor) -> None:
-        """A generation's losses."""
+        """Update the distribution with the losses of the generation."""
         strategy = self._strategy
         self._told.append(losses.tolist())
         strategy.tell(self._asked, self._told[-1])
@@ -50,17 +50,17 @@ class CMAES(Optimizer):
         self._advance(float(strategy.best.f), spread, end=spread < self.stage.tolerance or ended)
 
     def best(self) -> Tensor:
-        """The best of the mean, the best candidate and the start."""
+        """Best of three vectors: the mean, the best candidate and the start."""
         strategy = self._strategy
         ends = self._bounded(np.stack([strategy.mean, strategy.best.x, np.zeros_like(strategy.mean)]))
         return ends[int(self.problem.losses(ends).argmin())]
 
     def state_dict(self) -> dict[str, Any]:
-        """All losses it was told: with the same seed they lead to the same place."""
+        """All losses so far. With the same seed they reproduce the state."""
         return {"losses": [list(losses) for losses in self._told]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Tells a new strategy all of them again."""
+        """Restore a checkpoint by replaying all losses on a new strategy."""
         self.__init__(self.problem, self.stage, self.seed)  # type: ignore[misc]
         for losses in state["losses"]:
             self.tell(self.ask(), torch.tensor(losses, dtype=torch.float64, device=self.problem.device))

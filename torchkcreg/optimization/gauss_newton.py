@@ -1,4 +1,4 @@
-"""Gauss-Newton, a damped step at a time."""
+"""Gauss-Newton with damped steps."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from torch import Tensor
 
 from .optimizer import Optimizer, Options, Problem
 
-_HOLDS = 24  # how often what holds a step may be tripled
-_FIRM = 1e-2  # the least damping after a step that led up
-_NEGLIGIBLE = 2e-5  # of the loss
+_HOLDS = 24  # how often the term that shortens a step may be tripled
+_FIRM = 1e-2  # smallest damping after a rejected step
+_NEGLIGIBLE = 2e-5  # share of the loss: a smaller predicted decrease ends the optimisation
 
 
 class GaussNewton(Optimizer):
-    """Gauss-Newton with Levenberg-Marquardt damping (Marquardt 1963) and steps of at most ``stage.step_mm``.
+    """Gauss-Newton with Levenberg-Marquardt damping (Marquardt 1963) and steps of at most `stage.step_mm`.
 
-    The gradient is exact; the curvature is taken once, learns from every step that is taken, and is taken again when
-    steps stop agreeing with it. It also ends with a step that is taken and promised next to nothing: it moved what the
-    images hardly show by micrometres.
+    The gradient is exact. The curvature is computed once, updated with every accepted step (BFGS), and recomputed when
+    steps no longer agree with it. The optimisation also ends after an accepted step whose predicted decrease of the
+    loss is negligible: such steps only move, by micrometres, what the images hardly determine.
     """
 
     _KEPT: ClassVar[tuple[str, ...]] = ("_parameters", "_loss", "_gradient", "_curvature", "_fresh", "_damping")
@@ -31,16 +31,16 @@ class GaussNewton(Optimizer):
         self._damping, self._fresh = 1e-3, True
 
     def ask(self) -> Tensor:
-        """Where the next step leads."""
+        """Candidate after the next step, as a batch of one."""
         if self._curvature is None:
             self._loss, self._gradient = self.problem.loss_and_gradient(self._parameters)
             self._curvature = self.problem.curvature(self._parameters)
         return self._within_bounds(self._curvature)[None]
 
     def tell(self, candidates: Tensor, losses: Tensor) -> None:
-        """The step is taken if it leads down; else the next one is shorter."""
+        """Accept the step if it lowers the loss, else shorten the next one."""
         if self._curvature is None:
-            raise RuntimeError("ask comes before tell")
+            raise RuntimeError("call ask before tell")
         trial, trial_loss = candidates[0], float(losses[0])
         step = trial - self._parameters
         predicted = float(-(self._gradient @ step) - 0.5 * step @ self._curvature @ step)
@@ -63,17 +63,17 @@ class GaussNewton(Optimizer):
             self._curvature, self._fresh = self.problem.curvature(self._parameters), True
 
     def best(self) -> Tensor:
-        """Where it is."""
+        """Current parameters."""
         return self._parameters
 
     def state_dict(self) -> dict[str, Any]:
-        """Parameters, what is known of the loss there, and damping; nothing before the first iteration."""
+        """Parameters, loss, gradient, curvature and damping, for a checkpoint. Empty before the first iteration."""
         if self._curvature is None:
             return {}
         return {**{name: getattr(self, name) for name in self._KEPT}, **self._ended()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """All of them."""
+        """Restore a checkpoint."""
         if not state:
             return
         for name in self._KEPT:
@@ -82,11 +82,14 @@ class GaussNewton(Optimizer):
         self._end_as(state)
 
     def _within_bounds(self, curvature: Tensor) -> Tensor:
-        """Where a damped step leads inside the bounds; the free parameters know which ones a bound holds back."""
+        """Parameters after a damped step within the bounds.
+
+        If bounds cut the step, it is solved again for the other parameters with the bounded ones fixed.
+        """
         here, gradient = self._parameters, self._gradient
-        wanted = here + self._damped_step(curvature, gradient)
-        trial = self.problem.project(wanted[None])[0]
-        free = trial == wanted
+        unbounded = here + self._damped_step(curvature, gradient)
+        trial = self.problem.project(unbounded[None])[0]
+        free = trial == unbounded
         if free.all() or not free.any():
             return trial
         held = (trial - here)[~free]
@@ -95,25 +98,25 @@ class GaussNewton(Optimizer):
         return self.problem.project(trial[None])[0]
 
     def _damped_step(self, curvature: Tensor, gradient: Tensor) -> Tensor:
-        """The Levenberg-Marquardt step, held until no parameter moves by more than ``stage.step_mm``.
+        """Levenberg-Marquardt step, shortened until no parameter moves by more than `stage.step_mm`.
 
-        What holds it is the same for all parameters, which are all worth millimetres: those that the images hardly show
-        are held first, and do not shorten the others' steps.
+        The term added to the diagonal is the same for all parameters, since all are scaled to millimetres. So it first
+        shortens steps of parameters that the images hardly determine, and not those of the others.
         """
         diagonal = curvature.diagonal()
-        held = 1e-6 * float(diagonal.mean())
+        shortening = 1e-6 * float(diagonal.mean())
         for _ in range(_HOLDS):
-            step = -torch.linalg.solve(curvature + torch.diag(self._damping * diagonal + held), gradient)
+            step = -torch.linalg.solve(curvature + torch.diag(self._damping * diagonal + shortening), gradient)
             if float(step.abs().max()) <= self.stage.step_mm:
                 break
-            held *= 3
+            shortening *= 3
         return step * min(1.0, self.stage.step_mm / max(float(step.abs().max()), 1e-12))
 
 
 def learned(curvature: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """The curvature (D, D) with what a step taught of it, by how the gradient changed along it (BFGS).
+    """BFGS update of the curvature (D, D) from the change of the gradient along a step.
 
-    Powell's damping (1978) keeps it positive where the gradient fell along the step.
+    Powell's damping (1978) keeps it positive definite where the gradient decreases along the step.
     """
     along = curvature @ step
     expected, seen = float(step @ along), float(step @ change)

@@ -1,4 +1,4 @@
-"""What an optimiser of a registration's stages is: it asks for losses of candidates and is told them."""
+"""Interface of the optimisers of a registration's stages: `ask` for candidates, `tell` their losses."""
 
 from __future__ import annotations
 
@@ -12,30 +12,38 @@ from torch import Tensor
 
 
 class Options(Protocol):
-    """How long an optimiser may walk, and how far at a time; a stage of a registration is one.
+    """Limits of an optimiser. A stage of a registration provides them.
 
     Attributes:
-        iterations: At most so many.
-        tolerance: It ends when an iteration moves the implant by less, mm.
-        step_mm: Its first, or longest, step.
-        population: Candidates of a generation, where it has generations.
+        iterations: Largest number of iterations.
+        tolerance: The optimiser ends when an iteration moves the implant by less, mm.
+        step_mm: First, or longest, step, mm.
+        population: Candidates per generation, for optimisers with generations.
     """
 
     @property
-    def iterations(self) -> int: ...
+    def iterations(self) -> int:
+        """Largest number of iterations."""
+        ...
 
     @property
-    def tolerance(self) -> float: ...
+    def tolerance(self) -> float:
+        """Smallest motion of the implant in an iteration, mm."""
+        ...
 
     @property
-    def step_mm(self) -> float: ...
+    def step_mm(self) -> float:
+        """First, or longest, step, mm."""
+        ...
 
     @property
-    def population(self) -> int: ...
+    def population(self) -> int:
+        """Candidates per generation."""
+        ...
 
 
 class Problem(Protocol):
-    """What an optimiser may ask of a stage. Parameters are float64; zero is where the stage starts."""
+    """Objective of a stage. Parameters are float64 and zero at the start of the stage."""
 
     num_parameters: int
     device: torch.device
@@ -50,7 +58,7 @@ class Problem(Protocol):
         """Gauss-Newton approximation (D, D) of the loss's second derivatives."""
 
     def project(self, parameters: Tensor) -> Tensor:
-        """The nearest vectors (K, D) inside the bounds."""
+        """Nearest vectors (K, D) inside the bounds."""
 
 
 @dataclass(frozen=True)
@@ -63,18 +71,18 @@ class Progress:
 
 
 class Optimizer(ABC):
-    """Asks for the losses of candidates and is told them, until it is done.
+    """Base class of optimisers: repeats `ask` and `tell` until `done`, see `iterate`.
 
     Args:
-        problem: The stage's objective.
+        problem: Objective of the stage.
         stage: Iterations, tolerance, steps, population.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
 
     Attributes:
-        uses_losses: Whether `tell` looks at the losses; one that takes derivatives alone spares them.
-        progress: After the last iteration.
-        done: Whether it has ended.
-        converged: Whether it ended for another reason than that its iterations did.
+        uses_losses: True if `tell` uses the losses. If False, they are not computed.
+        progress: State after the last iteration.
+        done: True if it has ended.
+        converged: True if it ended for another reason than the limit of iterations.
     """
 
     uses_losses: ClassVar[bool] = True
@@ -86,26 +94,26 @@ class Optimizer(ABC):
 
     @abstractmethod
     def ask(self) -> Tensor:
-        """Candidates (K, D), within the bounds, whose losses it wants to know."""
+        """Candidates (K, D), within the bounds, whose losses are needed."""
 
     @abstractmethod
     def tell(self, candidates: Tensor, losses: Tensor) -> None:
-        """Takes up losses (K,) of the candidates that it asked for: one iteration."""
+        """Complete an iteration with the losses (K,) of the candidates from `ask`."""
 
     @abstractmethod
     def best(self) -> Tensor:
-        """The best parameters (D,) that it has found."""
+        """Best parameters (D,) so far."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain types from which :meth:`load_state_dict` goes on, in between two iterations."""
+        """State between two iterations as tensors and plain types, for `load_state_dict`."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from there, with the same problem, stage and seed, as if it had never stopped."""
+        """Restore a state of the same problem, stage and seed; continues exactly as without the interruption."""
 
     def _ended(self) -> dict[str, Any]:
-        """What every optimiser keeps."""
+        """Part of the state that all optimisers share."""
         return {"progress": list(vars(self.progress).values()), "done": self.done, "converged": self.converged}
 
     def _end_as(self, state: dict[str, Any]) -> None:
@@ -123,7 +131,7 @@ class Optimizer(ABC):
 
 
 def iterate(optimizer: Optimizer) -> None:
-    """One iteration."""
+    """Run one iteration."""
     candidates = optimizer.ask()
     losses = optimizer.problem.losses(candidates) if optimizer.uses_losses else candidates.new_zeros(len(candidates))
     optimizer.tell(candidates, losses)

@@ -1,4 +1,4 @@
-"""Named blocks of parameters that an optimiser walks in, with their bounds and what speaks against them."""
+"""Named blocks of the parameters of an optimisation, with bounds and penalties."""
 
 from __future__ import annotations
 
@@ -9,35 +9,32 @@ from torch import Tensor
 
 
 class ParameterBlock:
-    """Steps from where something is, so scaled that one of 1 changes an image about as much as a motion by 1 mm.
+    """Steps from the current state, scaled so that a step of 1 changes an image about as much as a motion by 1 mm.
 
-    A vector of zeros leaves all as it is. Derive from it and set ``num_parameters``; the rest has defaults.
+    Zeros change nothing. Derive from it and set `num_parameters`; all other members have defaults.
 
     Attributes:
-        num_parameters: How many there are.
-        loss_of_deviation: What the penalty is for a parameter that is one standard deviation off where a prior expects
-            it, if the penalty is the square of such deviations; 0 if it is none.
+        num_parameters: Number of parameters.
+        loss_of_deviation: Penalty of a parameter that is one standard deviation off the mean of its prior, if the
+            penalty is quadratic in such deviations; else 0.
     """
 
     num_parameters: int
     loss_of_deviation: float = 0.0
 
     def weigh(self, loss: float) -> None:
-        """Hears what a standard deviation of the images is worth in loss, for priors that have no weight of their own.
-
-        Forgets it by default.
-        """
+        """Set the loss of one standard deviation of the images, for priors without given weight. Ignored by default."""
 
     def clamp(self, steps: Tensor) -> Tensor:
-        """Steps (K, D) within their bounds; as they are by default."""
+        """Steps (K, D) clamped to their bounds. Unchanged by default."""
         return steps
 
     def penalty(self, steps: Tensor) -> Tensor:
-        """What speaks against steps (K, D) but the images, in units of the loss, shape (K,); nothing by default."""
+        """Penalty (prior) of steps (K, D) in units of the loss, shape (K,). Zero by default."""
         return steps.new_zeros(steps.shape[:-1])
 
     def at_bounds(self, share: float) -> list[str]:
-        """Names of parameters that now are within a share of their range of a bound; none by default."""
+        """Names of parameters within `share` of their range from a bound. None by default."""
         return []
 
     def at_rest(self, device: torch.device | str = "cpu") -> Tensor:
@@ -46,7 +43,7 @@ class ParameterBlock:
 
 
 class ParameterBlocks(Mapping[str, ParameterBlock]):
-    """Blocks under their names, one after the other in one vector.
+    """Named blocks, concatenated in one vector.
 
     >>> class Two(ParameterBlock):
     ...     num_parameters = 2
@@ -69,16 +66,16 @@ class ParameterBlocks(Mapping[str, ParameterBlock]):
 
     @property
     def num_parameters(self) -> int:
-        """Of all blocks."""
+        """Number of parameters of all blocks."""
         return sum(block.num_parameters for block in self._blocks.values())
 
     @property
     def places(self) -> dict[str, slice]:
-        """Where each block's parameters are."""
-        found, start = {}, 0
+        """Slice of each block in the vector."""
+        slices, start = {}, 0
         for name, block in self._blocks.items():
-            found[name] = slice(start, start := start + block.num_parameters)
-        return found
+            slices[name] = slice(start, start := start + block.num_parameters)
+        return slices
 
     def split(self, parameters: Tensor) -> dict[str, Tensor]:
         """Parameters (..., D) of each block.
@@ -92,17 +89,17 @@ class ParameterBlocks(Mapping[str, ParameterBlock]):
         return dict(zip(self._blocks, parts, strict=True))
 
     def clamp(self, parameters: Tensor) -> Tensor:
-        """Parameters (K, D), all within their bounds."""
+        """Parameters (K, D) clamped to their bounds."""
         parts = self.split(parameters)
         return torch.cat([self._blocks[name].clamp(part) for name, part in parts.items()], dim=-1)
 
     def penalty(self, parameters: Tensor) -> Tensor:
-        """What speaks against parameters (K, D) in all blocks, shape (K,)."""
+        """Sum of the penalties of all blocks for parameters (K, D), shape (K,)."""
         parts = self.split(parameters)
         return torch.stack([self._blocks[name].penalty(part) for name, part in parts.items()]).sum(0)
 
     def at_bounds(self, share: float) -> list[str]:
-        """Names of parameters that now are within a share of their range of a bound."""
+        """Names of parameters within `share` of their range from a bound."""
         return [name for block in self._blocks.values() for name in block.at_bounds(share)]
 
     def at_rest(self, device: torch.device | str = "cpu") -> Tensor:

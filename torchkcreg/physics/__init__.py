@@ -1,4 +1,4 @@
-"""Materials, spectra, intensity models and the detector: what turns path lengths in mm into measured line integrals."""
+"""X-ray physics: materials, spectra, scatter and intensity models that turn path lengths in mm into line integrals."""
 
 from .beam import Beam
 from .blur import gaussian_blur, gaussian_kernel

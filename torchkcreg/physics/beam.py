@@ -1,4 +1,4 @@
-"""The beam: its energies, how much of the signal each of them is, and what materials do to it."""
+"""X-ray beam: its energies, their weights in the detected signal, and the attenuation of materials at them."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from .transmission import transmission
 
 
 class Beam(ExactModule):
-    """Energies of one spectrum or, by source, of several, and the attenuation of materials at them.
+    """Energies of one spectrum, or of one spectrum per source, and the attenuation of materials at them.
 
     Args:
-        energies_kev: (E,).
-        weights: Shares of the signal, (E,), or (S, E), one row a source; each row sums to one.
-        attenuation: Of the materials, 1/mm, (M, E).
-        sources: Names of the S sources, where there are several spectra.
-        aluminium: Attenuation of aluminium, (E,), by which :meth:`hardened` filters; nothing if not given.
+        energies_kev: Energies, keV, (E,).
+        weights: Shares of the detected signal, (E,), or (S, E) with one row per source. Each row sums to one.
+        attenuation: Linear attenuation of the materials, 1/mm, (M, E).
+        sources: Names of the S sources if each has its own spectrum.
+        aluminium: Attenuation of aluminium, 1/mm, (E,), for `hardened`. Zero if not given.
 
     Attributes:
         energies_kev, weights, attenuation, aluminium: Buffers, float64.
 
     Raises:
-        ValueError: If shapes do not fit.
+        ValueError: If shapes do not match.
     """
 
     exact_buffers: ClassVar[tuple[str, ...]] = ("energies_kev", "weights", "attenuation", "aluminium")
@@ -63,12 +63,12 @@ class Beam(ExactModule):
     def of(
         cls, materials: Sequence[Material], spectrum: Spectrum | Mapping[str, Spectrum], *, num_bins: int | None = 20
     ) -> Beam:
-        """The beam of a detected spectrum, or of one for each source, with the fewest energies that transmit alike.
+        """Beam of a detected spectrum, or of one per source, reduced to few energies with the same transmission.
 
         Args:
-            materials: In the order of the path lengths' M; at least one.
-            spectrum: As detected.
-            num_bins: The most energies kept of each spectrum; None keeps its own.
+            materials: Materials in the order of the path lengths' axis M; at least one.
+            spectrum: Detected spectrum, or one for each source by its name.
+            num_bins: Largest number of energies per spectrum. None keeps the spectrum as it is.
 
         >>> beam = Beam.of([material("water")], Spectrum((40.0, 60.0), (1.0, 3.0)))
         >>> beam
@@ -76,23 +76,23 @@ class Beam(ExactModule):
         """
         if not materials:
             raise ValueError("materials must hold at least one material, got none")
-        several = {"": spectrum} if isinstance(spectrum, Spectrum) else dict(spectrum)
-        kept = [s if num_bins is None else s.reduced(materials, num_bins) for s in several.values()]
-        energies = [energy for one in kept for energy in one.energies_kev]
-        weights = torch.block_diag(*(torch.tensor([one.weights], dtype=torch.float64, device="cpu") for one in kept))
+        spectra_by_source = {"": spectrum} if isinstance(spectrum, Spectrum) else dict(spectrum)
+        reduced = [s if num_bins is None else s.reduced(materials, num_bins) for s in spectra_by_source.values()]
+        energies = [energy for s in reduced for energy in s.energies_kev]
+        weights = torch.block_diag(*(torch.tensor([s.weights], dtype=torch.float64, device="cpu") for s in reduced))
         return cls(
             torch.tensor(energies, dtype=torch.float64, device="cpu"),
             weights[0] if isinstance(spectrum, Spectrum) else weights,
             torch.stack([m.attenuation(energies) for m in materials]),
-            sources=None if isinstance(spectrum, Spectrum) else list(several),
+            sources=None if isinstance(spectrum, Spectrum) else list(spectra_by_source),
             aluminium=material("aluminium").attenuation(energies),
         )
 
     def weights_of(self, views: Sequence[str] | None) -> Tensor:
-        """Weights (E,) of the one spectrum, or (V, E) of views whose sources have these names.
+        """Weights (E,) of a single spectrum, or (V, E) of views given the names of their sources.
 
         Raises:
-            ValueError: If there are several spectra, and a view of none of them.
+            ValueError: If there are several spectra and a view has no source or an unknown one.
         """
         if self.sources is None:
             return self.weights
@@ -103,13 +103,13 @@ class Beam(ExactModule):
         return self.weights[[self.sources.index(name) for name in views]]
 
     def hardened(self, hardness: Tensor, views: Sequence[str] | None = None) -> Tensor:
-        """Weights (K, V or 1, E) behind aluminium of hardness (K,) in mm, taken away where that is negative."""
-        own = self.weights_of(views)
-        logs = own.log() if own.dim() == 2 else own.log()[None]
+        """Weights (K, V or 1, E) behind `hardness` (K,) mm of aluminium; a negative value removes filtration."""
+        unfiltered = self.weights_of(views)
+        logs = unfiltered.log() if unfiltered.dim() == 2 else unfiltered.log()[None]
         return torch.softmax(logs - hardness.to(logs)[:, None, None] * self.aluminium, dim=-1)
 
     def behind(self, hardness: float, materials: Sequence[int]) -> Beam:
-        """The beam of one spectrum behind so many mm of aluminium, with some of the materials, by their numbers."""
+        """Beam of a single spectrum behind `hardness` mm of aluminium, for the materials with these indices."""
         weights = self.hardened(self.weights.new_tensor([hardness]))[0, 0]
         return Beam(self.energies_kev, weights, self.attenuation[list(materials)], aluminium=self.aluminium)
 
@@ -122,7 +122,7 @@ class Beam(ExactModule):
         pooling: int = 1,
         backend: str = "auto",
     ) -> Tensor:
-        """What of the beam passes path lengths (K, M, V, rows, cols), see :func:`torchkcreg.physics.transmission`."""
+        """Transmission behind path lengths (K, M, V, rows, cols), see `torchkcreg.physics.transmission`."""
         return transmission(
             path_lengths,
             self.attenuation,
@@ -133,6 +133,6 @@ class Beam(ExactModule):
         )
 
     def extra_repr(self) -> str:
-        """Energies, materials and sources."""
+        """Numbers of energies and materials, and the sources."""
         of = "" if self.sources is None else f", sources={', '.join(self.sources)}"
         return f"energies={len(self.energies_kev)}, materials={len(self.attenuation)}{of}"

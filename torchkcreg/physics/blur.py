@@ -18,8 +18,8 @@ SMALLEST_SIGMA = 1e-3
 def gaussian_kernel(sigma_px: Tensor) -> Tensor:
     """Gaussian samples at -R..R, summing to one: shape `(..., 2R + 1)` for sigmas `(...)`.
 
-    R reaches 4.5 of the largest sigma (the tail beyond is 1e-5), so a step in R moves nothing that counts.
-    Differentiable in sigma; a sigma of zero gives the identity, and a zero gradient.
+    R is 4.5 times the largest sigma. The tail beyond is 1e-5, so the result barely changes when R jumps by a pixel.
+    Differentiable in sigma. A sigma of zero gives the identity, with a zero gradient.
     """
     sigma = sigma_px.abs().clamp_min(SMALLEST_SIGMA)
     largest = float(sigma.detach().max())
@@ -30,15 +30,15 @@ def gaussian_kernel(sigma_px: Tensor) -> Tensor:
 
 
 def gaussian_blur(images: Tensor, sigma_px: Tensor | float, *, backend: str = "auto") -> Tensor:
-    """Images `(..., rows, cols)` blurred by a Gaussian; beyond the border they go on as their last pixels.
+    """Images `(..., rows, cols)` blurred by a Gaussian, with the border pixels repeated outwards.
 
     Args:
-        images: Images.
-        sigma_px: Standard deviation in pixels, the same in both directions; one number for all.
+        images: Images, shape `(..., rows, cols)`.
+        sigma_px: Standard deviation in pixels, the same in both directions and for all images.
         backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
-        Differentiable in the images.
+        Blurred images of the same shape, differentiable in the images.
     """
     sigma = torch.as_tensor(sigma_px, dtype=images.dtype, device=images.device)
     kernel = gaussian_kernel(sigma.detach())
@@ -53,7 +53,7 @@ def gaussian_blur(images: Tensor, sigma_px: Tensor | float, *, backend: str = "a
 
 
 def convolve(images: Tensor, kernel: list[float], dim: int) -> Tensor:
-    """Images correlated with an odd kernel along one of their last two dimensions, the border repeated."""
+    """Correlate images with an odd kernel along one of their last two dimensions, with the border repeated."""
     radius, size = len(kernel) // 2, images.shape[dim]
     if radius == 0:
         return images * kernel[0]
@@ -66,7 +66,7 @@ def convolve(images: Tensor, kernel: list[float], dim: int) -> Tensor:
 
 
 def convolve_by(images: Tensor, kernel: Tensor, dim: int) -> Tensor:
-    """`convolve` of each candidate (K, V, rows, cols) by its own kernel (K, odd); differentiable in both, any order."""
+    """`convolve` with one kernel (K, odd) per candidate (K, V, rows, cols); differentiable in both to any order."""
     radius, size = kernel.shape[-1] // 2, images.shape[dim]
     steps = torch.arange(size + 2 * radius, device=images.device).sub(radius).clamp(0, size - 1)
     padded = images.index_select(dim, steps)
@@ -78,7 +78,7 @@ def convolve_by(images: Tensor, kernel: Tensor, dim: int) -> Tensor:
 
 
 def _repeat_border(images: Tensor, radius: int, dim: int) -> Tensor:
-    """Images with `radius` copies of their first and last line along a dimension."""
+    """Pad images with `radius` copies of their first and last line along a dimension."""
     sides = (0, 0, radius, radius) if dim == -2 else (radius, radius, 0, 0)
     flat = images.reshape(-1, 1, *images.shape[-2:])
     padded = pad(flat, sides, mode="replicate")
@@ -86,7 +86,7 @@ def _repeat_border(images: Tensor, radius: int, dim: int) -> Tensor:
 
 
 def _add_scaled(total: Tensor, term: Tensor, scale: float) -> Tensor:
-    """`total + scale * term`, in place where autograd does not look."""
+    """`total + scale * term`, in place unless autograd tracks `total`."""
     if total.requires_grad:
         return total.add(term, alpha=scale)
     return total.add_(term, alpha=scale)
@@ -99,7 +99,7 @@ def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _blur(images: Tensor, kernel: Tensor, transposed: bool) -> Tensor:
-    """The definition, in plain torch; transposed, by autograd."""
+    """Reference in plain torch; the transpose by autograd."""
     if not transposed:
         return _blurred(images, kernel)
     leaf = torch.zeros_like(images).requires_grad_(True)

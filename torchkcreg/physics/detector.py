@@ -1,4 +1,4 @@
-"""From the detector's counts to line integrals."""
+"""Conversion of detector counts to line integrals."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ def line_integrals_from_intensity(
     floor: float = COUNT_FLOOR,
     saturation: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Line integrals `-ln(I / I0)` and the mask of the pixels that can be trusted.
+    """Line integrals `-ln(I / I0)` and the mask of valid pixels.
 
-    An intensity below `floor` is taken as `floor`: half a count by default, the most that an integer detector's zero
-    can hide. Such a pixel still has a finite line integral, ln(I0 / floor), and nothing is NaN.
+    Intensities below `floor` are raised to `floor`, by default half a count: the largest value that an integer detector
+    rounds to zero. So every line integral is finite, at most ln(I0 / floor), and never NaN.
 
     Args:
         intensity: Detector counts, `(V, rows, cols)`, integer or floating.
-        open_beam: Counts of the unattenuated beam: one number, one a view `(V,)`, or an image that broadcasts.
-        floor: Smallest count that is taken at its word.
-        saturation: Count from which on a pixel is full; None where the detector does not saturate.
+        open_beam: Counts of the unattenuated beam: one number, one per view `(V,)`, or an image that broadcasts.
+        floor: Smallest count; lower ones are raised to it.
+        saturation: Counts from this value on are saturated. None if the detector does not saturate.
 
     Returns:
         Line integrals, float32 (float64 for float64 counts), and a boolean mask of the same shape: False where the
         count is not above zero, not finite, or saturated.
 
     Raises:
-        ValueError: If the open beam or the floor is not positive, or the open beam's shape fits no view.
+        ValueError: If the open beam or the floor is not positive, or the open beam's shape does not match the views.
 
     >>> line_integrals, valid = line_integrals_from_intensity(torch.tensor([[[1000, 0, 368]]]), 1000.0)
     >>> valid.tolist()

@@ -1,4 +1,4 @@
-"""Intensity models: what stands between path lengths in mm and the line integrals that a detector reports."""
+"""Intensity models: from path lengths in mm to the line integrals that a detector reports."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from .materials import Material, material
 from .scatter import scattered_signal
 from .spectra import Spectrum
 
-# Standard deviations of where scanners and limbs have these parameters.
+# Standard deviations of these parameters over scanners and limbs, used as priors.
 _LIKELY_SCATTER = 0.2
-_LIKELY_BLUR = 0.4  # of the start: focal spots and scintillators
+_LIKELY_BLUR = 0.4  # relative to the start value: varies with focal spot and scintillator
 _LEAST_LIKELY_BLUR_PX = 0.1
-_LIKELY_HARDNESS_MM = {True: 0.5, False: 3.0}  # of aluminium: spectrum known, unknown
+_LIKELY_HARDNESS_MM = {True: 0.5, False: 3.0}  # of aluminium, by whether the spectrum is known
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class FreeParameter:
     """A scalar of an intensity model that may be estimated along with a motion.
 
     Attributes:
-        attribute: Its name in the model, a parameter and a keyword of `forward`.
+        attribute: Name of the model's parameter and of the keyword of `forward`.
         scale: A step that changes a radiograph about as much as a motion by 1 mm.
         low: Lower bound.
         high: Upper bound.
-        likely: Where it most likely is.
-        deviation: Standard deviation about that.
-        in_pixels: It is a length in pixels.
+        likely: Most likely value.
+        deviation: Standard deviation about the most likely value.
+        in_pixels: True if it is a length in pixels.
     """
 
     attribute: str
@@ -50,11 +50,11 @@ class FreeParameter:
 
 
 class IntensityModel(nn.Module):
-    """Path lengths (K, M, V, rows, cols) of M materials to line integrals (K, V, rows, cols).
+    """Base class: maps path lengths (K, M, V, rows, cols) of M materials to line integrals (K, V, rows, cols).
 
     Attributes:
-        has_background: The last of the materials stands for what is not known (bone, water).
-        free: What may be estimated, by short names.
+        has_background: True if the last material is the unknown background (bone, water).
+        free: Parameters that may be estimated, by short names.
     """
 
     has_background: bool = False
@@ -64,39 +64,39 @@ class IntensityModel(nn.Module):
         self.free = dict(free or {})
 
     def arguments(self, pixel_px: float, **overrides: Tensor) -> dict[str, Tensor]:
-        """Keyword arguments of `forward` for images of other pixels, each of shape (K,), K = 1 without overrides.
+        """Keyword arguments of `forward` for a given pixel size, each of shape (K,); K = 1 without overrides.
 
         Args:
-            pixel_px: Edge of the images' pixels, in those that the model's own lengths count.
-            overrides: Values (K,) of attributes in place of the model's own.
+            pixel_px: Edge of the images' pixels, in the pixels that the model's lengths are given in.
+            overrides: Values (K,) that replace attributes of the model.
         """
-        found = {}
+        keywords = {}
         for free in self.free.values():
             value = overrides.get(free.attribute, getattr(self, free.attribute).detach()[None])
-            found[free.attribute] = value / pixel_px if free.in_pixels else value
-        return found
+            keywords[free.attribute] = value / pixel_px if free.in_pixels else value
+        return keywords
 
     def to_dict(self) -> dict[str, Any]:
-        """The model as plain types, for files; "model" names what reads it."""
+        """Model as plain types, for files. "model" names the kind of model, see `intensity_from_dict`."""
         raise NotImplementedError(f"{type(self).__name__} cannot be written: it has no to_dict")
 
     def of_sources(self, sources: Sequence[str] | None) -> dict[str, Any]:
-        """Keyword arguments of `forward` that depend on the names of the views' sources; none by default."""
+        """Keyword arguments of `forward` that depend on the sources of the views. None by default."""
         return {}
 
 
 class IdentityIntensity(IntensityModel):
-    """Path lengths as they are, summed over the materials: the model of Cao et al. 2020."""
+    """Sum of the path lengths over the materials, without any physics: the model of Cao et al. 2020."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Nothing but the model's name."""
+        """Name of the model."""
         return {"model": "identity"}
 
     def forward(self, path_lengths: Tensor, *, pooling: int = 1) -> Tensor:
-        """Summed path lengths `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)`, averaged over squares.
+        """Path lengths `(..., M, V, rows, cols)` summed to `(..., V, rows, cols)` and averaged over squares of pixels.
 
         Args:
-            path_lengths: Path lengths, one image a material and view.
+            path_lengths: Path lengths, one image per material and view.
             pooling: Side of the squares of pixels that are averaged.
         """
         _check_path_lengths(path_lengths, None, pooling)
@@ -107,33 +107,34 @@ class IdentityIntensity(IntensityModel):
 
 
 class PolyenergeticTransmission(IntensityModel):
-    """Line integrals behind several materials, with beam hardening, the system's blur and a scatter floor.
+    """Line integrals behind several materials, with beam hardening, system blur and scatter.
 
-    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s p + r q) + ln(1 + s)`; zero where nothing stands in the beam. The
-    blur acts on intensities, before the logarithm, as it does in the detector; with hardening it moves apparent edges.
-    Scatter comes with what passes the object, `s p` (Sun & Star-Lack 2010), and from what the object takes from the
-    beam, `r q` (Ohnesorge et al. 1999).
+    `y = -ln(blur(sum_k w_k exp(-sum_m mu_mk L_m)) + s p + r q) + ln(1 + s)`; zero in the open beam. The
+    blur acts on intensities, before the logarithm, as in the detector; together with beam hardening it shifts apparent
+    edges. One part of the scatter is proportional to the transmitted beam, `s p` (Sun & Star-Lack 2010), the other to
+    the intensity that the object removes from the beam, `r q` (Ohnesorge et al. 1999).
 
     Args:
-        materials: The materials, in the order of the path lengths' M.
-        spectrum: The detected spectrum, or one for each source by its name. It is reduced to the fewest energies that
-            transmit alike.
-        scatter: Scatter s that comes with what passes, in units of the open beam.
-        scatter_removed: Scatter r from what is removed; it needs a shape.
+        materials: Materials, in the order of the path lengths' axis M.
+        spectrum: The detected spectrum, or one for each source by its name. It is reduced to the fewest energies with
+            the same transmission.
+        scatter: Scatter s proportional to the transmitted beam, in units of the open beam.
+        scatter_removed: Scatter r proportional to the removed intensity; needs `scatter_shapes` in `forward`.
         blur_sigma_px: Standard deviation of the system's point spread, pixels.
-        hardness: Filtration added to the spectrum (taken away where negative), mm of aluminium:
+        hardness: Filtration added to the spectrum (removed if negative), mm of aluminium:
             `w_k *= exp(-mu_Al(E_k) hardness)`, normalised again.
-        num_bins: The most energies kept; None keeps the spectrum's own.
-        background: A last material that stands for what is not known.
-        spectrum_is_known: The spectrum is the scanner's own, not a likely one: hardness is then known better.
+        num_bins: Largest number of energies. None keeps the spectrum as it is.
+        background: Material of the unknown background, appended to `materials`.
+        spectrum_is_known: True if the spectrum was measured or given for this scanner. The prior on `hardness` is then
+            narrower.
 
     Attributes:
-        scatter, scatter_removed, blur_sigma_px, hardness: Scalar parameters, float64, which a fit may move. The
-            gradient to `blur_sigma_px` vanishes at zero: start a fit of it from a third of a pixel or more.
-        beam: Energies kept, their weights and the materials' attenuation, see :class:`Beam`.
+        scatter, scatter_removed, blur_sigma_px, hardness: Scalar parameters, float64, that can be fitted. The gradient
+            to `blur_sigma_px` vanishes at zero: start its fit from a third of a pixel or more.
+        beam: Energies, their weights and the materials' attenuation, see `Beam`.
 
     Raises:
-        ValueError: If there are no materials, or scatter or blur are negative.
+        ValueError: If there are no materials, or scatter or blur is negative.
 
     >>> from torchkcreg.physics import material, tungsten_spectrum
     >>> model = PolyenergeticTransmission([material("steel")], tungsten_spectrum(90), scatter=0.05)
@@ -202,7 +203,7 @@ class PolyenergeticTransmission(IntensityModel):
         }
 
     def of_sources(self, sources: Sequence[str] | None) -> dict[str, Any]:
-        """The sources, where each has a spectrum of its own."""
+        """Names of the sources if each has its own spectrum, else empty."""
         return {} if self.beam.sources is None else {"sources": sources}
 
     @full_precision
@@ -221,25 +222,25 @@ class PolyenergeticTransmission(IntensityModel):
         """Line integrals `(..., V, rows, cols)` of path lengths `(..., M, V, rows, cols)` in mm.
 
         Args:
-            path_lengths: Path lengths, one image a material and view, any leading candidate axes.
-            scatter: Per candidate, in place of the module's own: a scalar or of the shape of the candidate axes.
+            path_lengths: Path lengths, one image per material and view, with any leading candidate axes.
+            scatter: Replaces the module's value: a scalar, or one value per candidate (shape of the candidate axes).
             scatter_removed: As `scatter`.
             blur_sigma_px: As `scatter`.
             hardness: As `scatter`.
-            pooling: Transmissions are averaged over squares of this many pixels a side after the blur. Path lengths on
-                pixels finer than the detector's follow sharp edges better: an average of exponentials is not the
+            pooling: Edge of the squares of pixels over which transmissions are averaged after the blur. Path lengths on
+                pixels finer than the detector's model sharp edges better: the average of exponentials is not the
                 exponential of the average.
-            scatter_shapes: How both kinds of scatter are spread over the detector, p and q, of shape
-                (2, V, rows, cols) after pooling. None: p is even, and q is nothing.
-            sources: Names of the views' sources, where each source has a spectrum of its own.
+            scatter_shapes: Spatial distributions p and q of both kinds of scatter after pooling, (2, V, rows, cols).
+                None: p is 1 everywhere and q is 0.
+            sources: Names of the views' sources if each source has its own spectrum.
 
         Raises:
-            ValueError: If the path lengths' M is not the number of materials, or an override fits no candidate axis, or
-                pooling does not divide the images.
+            ValueError: If the path lengths' axis M is not the number of materials, an override does not match the
+                candidate axes, or pooling does not divide the images.
         """
         _check_path_lengths(path_lengths, len(self.material_names), pooling)
         leading = path_lengths.shape[:-4]
-        # the few numbers a candidate in the module's own precision; the images in theirs
+        # the few parameters of a candidate keep the module's precision, images keep that of the path lengths
         hardness = _per_candidate("hardness", self.hardness, hardness, leading)
         sigma = _per_candidate("blur_sigma_px", self.blur_sigma_px, blur_sigma_px, leading)
         weights = self.beam.hardened(hardness, sources)
@@ -253,8 +254,8 @@ class PolyenergeticTransmission(IntensityModel):
 
     def _scatter_levels(self, passed: Tensor | None, removed: Tensor | None, leading: torch.Size) -> Tensor:
         """Levels (K, 2) of both kinds of scatter."""
-        own = {"scatter": (self.scatter, passed), "scatter_removed": (self.scatter_removed, removed)}
-        return torch.stack([_per_candidate(name, *levels, leading) for name, levels in own.items()], dim=-1)
+        levels_by_name = {"scatter": (self.scatter, passed), "scatter_removed": (self.scatter_removed, removed)}
+        return torch.stack([_per_candidate(name, *levels, leading) for name, levels in levels_by_name.items()], dim=-1)
 
     def extra_repr(self) -> str:
         """Materials and number of energies."""
@@ -267,7 +268,7 @@ def _parameter(value: float) -> nn.Parameter:
 
 
 def _check_path_lengths(path_lengths: Tensor, num_materials: int | None, pooling: int) -> None:
-    """Raise ValueError unless the path lengths have the shape (..., M, V, rows, cols), divided by pooling."""
+    """Raise ValueError unless path lengths have shape (..., M, V, rows, cols) and pooling divides rows and cols."""
     if path_lengths.dim() < 4 or num_materials not in (None, path_lengths.shape[-4]):
         expected = "M" if num_materials is None else num_materials
         raise ValueError(
@@ -277,9 +278,9 @@ def _check_path_lengths(path_lengths: Tensor, num_materials: int | None, pooling
         raise ValueError(f"pooling must divide rows and cols, got {pooling} for {tuple(path_lengths.shape[-2:])}")
 
 
-def _per_candidate(name: str, own: Tensor, override: Tensor | None, leading: torch.Size) -> Tensor:
-    """The value of each candidate, flat: the override's where given, else the module's own."""
-    value = own if override is None else torch.as_tensor(override, dtype=own.dtype, device=own.device)
+def _per_candidate(name: str, default: Tensor, override: Tensor | None, leading: torch.Size) -> Tensor:
+    """Value of each candidate, flattened: the override if given, else the module's value."""
+    value = default if override is None else torch.as_tensor(override, dtype=default.dtype, device=default.device)
     try:
         return value.broadcast_to(leading).reshape(-1)
     except RuntimeError as error:
@@ -287,7 +288,7 @@ def _per_candidate(name: str, own: Tensor, override: Tensor | None, leading: tor
 
 
 def intensity_from_dict(content: Any) -> IntensityModel:
-    """The intensity model that `IntensityModel.to_dict` described.
+    """Intensity model from the output of `IntensityModel.to_dict`.
 
     Raises:
         ValueError: A key is missing or malformed; the message names it.
@@ -311,5 +312,5 @@ def intensity_from_dict(content: Any) -> IntensityModel:
 
 
 def _spectrum(energies: Sequence[float], weights: Sequence[float]) -> Spectrum:
-    kept = sorted((energy, weight) for energy, weight in zip(energies, weights, strict=True) if weight > 0)
-    return Spectrum(tuple(energy for energy, _ in kept), tuple(weight for _, weight in kept))
+    positive = sorted((energy, weight) for energy, weight in zip(energies, weights, strict=True) if weight > 0)
+    return Spectrum(tuple(energy for energy, _ in positive), tuple(weight for _, weight in positive))

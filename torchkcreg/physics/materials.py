@@ -1,4 +1,4 @@
-"""Attenuation of the usual alloys, tissues and phantom materials, from packaged tables of 10 to 150 keV."""
+"""Attenuation (10 to 150 keV) and elastic constants of alloys, tissues and phantom materials, from packaged tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_DISSOLVED = 200.0  # mg/mL of calcium; attenuation is linear in it
+_DISSOLVED = 200.0  # mg/mL of calcium; attenuation is linear in the concentration
 _CALCIUM = re.compile(r"ca(\d+\.?\d*)")
 ALIASES = {
     "316l": "steel",
@@ -37,8 +37,8 @@ class Material:
     Attributes:
         name: Name for messages and labels.
         density_g_cm3: Density, g/cm^3.
-        energies_kev: Rising energies, keV. An energy that stands twice is an absorption edge: below it, above it.
-        mass_attenuation_cm2_g: Total mass attenuation coefficient at these energies, cm^2/g.
+        energies_kev: Rising energies, keV. An absorption edge is listed twice, with the values below and above it.
+        mass_attenuation_cm2_g: Total mass attenuation coefficients at these energies, cm^2/g.
 
     Raises:
         ValueError: If the density is not positive or the table is not one of rising energies and positive values.
@@ -62,10 +62,10 @@ class Material:
             raise ValueError(f"table of {self.name} must have rising energies and positive values")
 
     def attenuation(self, energies_kev: Tensor | np.ndarray | Sequence[float] | float) -> Tensor:
-        """Linear attenuation coefficient in 1/mm, float64, of the shape of the energies.
+        """Linear attenuation coefficients, 1/mm, float64, in the shape of the energies.
 
-        Interpolated linearly in the logarithms of energy and attenuation, never across an absorption edge (an edge's
-        own energy belongs to the side above it).
+        Interpolated linearly in the logarithms of energy and attenuation, never across an absorption edge. At an edge
+        the value above it is used.
 
         Args:
             energies_kev: Energies, keV, any shape, inside the table.
@@ -74,34 +74,34 @@ class Material:
             ValueError: If an energy lies outside the table.
         """
         device = energies_kev.device if isinstance(energies_kev, Tensor) else "cpu"
-        asked = torch.as_tensor(energies_kev, dtype=torch.float64, device=device)
-        table = torch.tensor(self.energies_kev, dtype=torch.float64, device=asked.device)
-        if asked.numel() and not bool(((asked >= table[0]) & (asked <= table[-1])).all()):
-            low, high = float(asked.min()), float(asked.max())
+        energies = torch.as_tensor(energies_kev, dtype=torch.float64, device=device)
+        table = torch.tensor(self.energies_kev, dtype=torch.float64, device=energies.device)
+        if energies.numel() and not bool(((energies >= table[0]) & (energies <= table[-1])).all()):
+            low, high = float(energies.min()), float(energies.max())
             span = f"{table[0]:g} to {table[-1]:g} keV"
             raise ValueError(f"energies_kev must lie within {span} ({self.name}), got {low:g} to {high:g}")
-        values = torch.tensor(self.mass_attenuation_cm2_g, dtype=torch.float64, device=asked.device).log()
-        # right=True: an interval never starts at the first of an edge's two entries, so its width is never zero
-        lower = (torch.searchsorted(table, asked.contiguous(), right=True) - 1).clamp(0, len(table) - 2)
+        values = torch.tensor(self.mass_attenuation_cm2_g, dtype=torch.float64, device=energies.device).log()
+        # right=True: no interval starts at the first of the two entries of an edge, so no width is zero
+        lower = (torch.searchsorted(table, energies.contiguous(), right=True) - 1).clamp(0, len(table) - 2)
         table = table.log()
-        fraction = (asked.log() - table[lower]) / (table[lower + 1] - table[lower])
+        fraction = (energies.log() - table[lower]) / (table[lower + 1] - table[lower])
         mass_attenuation = torch.lerp(values[lower], values[lower + 1], fraction).exp()
         return mass_attenuation * (self.density_g_cm3 / 10)
 
     def with_density(self, density_g_cm3: float) -> Material:
-        """The same substance at another density, g/cm^3 (a porous bone, a needle scintillator)."""
+        """Same substance at another density, g/cm^3 (porous bone, a needle scintillator)."""
         return replace(self, density_g_cm3=float(density_g_cm3))
 
 
 def material(name: str, *, density: float | None = None) -> Material:
-    """A packaged material by name, upper or lower case, at its usual density or at `density` g/cm^3.
+    """Packaged material by its name (case does not matter), at its usual density or at `density` g/cm^3.
 
     Among others `steel` (316L, 7.95 g/cm^3), `titanium` (Ti-6Al-4V, 4.43), `cocr` (ASTM F75, 8.3), `aluminium`,
-    `copper`, `water`, `soft_tissue`, `cortical_bone` (ICRU 44, 1.92), `cancellous_bone`, `pmma`, `csi`; all of them in
-    `material_names()`. `ca50` is water with 50 mg/mL of calcium, and so is any other number.
+    `copper`, `water`, `soft_tissue`, `cortical_bone` (ICRU 44, 1.92), `cancellous_bone`, `pmma`, `csi`; the full list
+    is `material_names()`. `ca50` is water with 50 mg/mL of calcium; other numbers work alike.
 
     Raises:
-        ValueError: If there is no such material; the message lists those there are.
+        ValueError: If there is no such material; the message lists the available ones.
 
     >>> material("steel").density_g_cm3, material("Ti-6Al-4V").name
     (7.95, 'titanium')
@@ -109,12 +109,12 @@ def material(name: str, *, density: float | None = None) -> Material:
     key = name.strip().lower().replace(" ", "_")
     key = ALIASES.get(key, key)
     if match := _CALCIUM.fullmatch(key):
-        found = calcium_in_water(float(match[1]))
+        substance = calcium_in_water(float(match[1]))
     elif key in material_names():
-        found = _packaged_material(key)
+        substance = _packaged_material(key)
     else:
         raise ValueError(f"material must be one of {', '.join(material_names())}, ca50 and so on, got {name!r}")
-    return found if density is None else found.with_density(density)
+    return substance if density is None else substance.with_density(density)
 
 
 def material_names() -> tuple[str, ...]:
@@ -123,11 +123,11 @@ def material_names() -> tuple[str, ...]:
 
 
 def mixture(name: str, parts: Mapping[str, float], *, density: float) -> Material:
-    """A mixture of packaged materials by mass.
+    """Mixture of packaged materials by mass.
 
     Args:
         name: Name of the mixture.
-        parts: Mass of each packaged material, in any one unit; fractions are formed here.
+        parts: Mass of each packaged material, all in the same unit. They are normalised to fractions.
         density: Density of the mixture, g/cm^3.
 
     Raises:
@@ -138,16 +138,16 @@ def mixture(name: str, parts: Mapping[str, float], *, density: float) -> Materia
     """
     if not parts or min(parts.values()) <= 0:
         raise ValueError(f"parts must be positive masses, got {dict(parts)}")
-    found = [material(part) for part in parts]
+    substances = [material(part) for part in parts]
     masses = np.array(list(parts.values()), dtype=float)
-    table = np.array([part.mass_attenuation_cm2_g for part in found])
-    return Material(name, float(density), found[0].energies_kev, tuple((masses / masses.sum()) @ table))
+    table = np.array([part.mass_attenuation_cm2_g for part in substances])
+    return Material(name, float(density), substances[0].energies_kev, tuple((masses / masses.sum()) @ table))
 
 
 def calcium_in_water(concentration_mg_ml: float) -> Material:
-    """Calcium dissolved in water, as in calibration rods: its attenuation is that of water plus that of the calcium.
+    """Calcium dissolved in water, as in calibration rods: the attenuations of water and calcium add up.
 
-    The calcium adds to the mass and takes no room: the density is 1 + concentration/1000 g/cm^3.
+    The calcium adds mass but no volume: the density is 1 + concentration/1000 g/cm^3.
 
     Args:
         concentration_mg_ml: Calcium per volume, mg/mL; zero is water.
@@ -168,13 +168,13 @@ def calcium_in_water(concentration_mg_ml: float) -> Material:
 
 
 def calcium_attenuation(energies_kev: Sequence[float]) -> Tensor:
-    """What each mg/mL of dissolved calcium adds to water's attenuation, 1/mm."""
+    """Increase of water's attenuation per mg/mL of dissolved calcium, 1/mm."""
     dissolved = calcium_in_water(_DISSOLVED).attenuation(energies_kev)
     return (dissolved - material("water").attenuation(energies_kev)) / _DISSOLVED
 
 
 def calcium_of(attenuation: Tensor, reference_kev: float) -> Tensor:
-    """Calcium in mg/mL of attenuation in 1/mm at an energy, of what is water and calcium alone.
+    """Calcium concentration, mg/mL, from the attenuation (1/mm, at `reference_kev`) of a mixture of water and calcium.
 
     >>> round(float(calcium_of(calcium_in_water(150).attenuation((60.0,)), 60.0)))
     150
@@ -184,7 +184,7 @@ def calcium_of(attenuation: Tensor, reference_kev: float) -> Tensor:
 
 
 def packaged_rows(file_name: str) -> Iterator[list[str]]:
-    """Rows of a packaged table, its comment lines left out."""
+    """Rows of a packaged table, without comment lines."""
     text = (resources.files("torchkcreg.physics") / "data" / file_name).read_text(encoding="utf-8")
     return csv.reader(line for line in text.splitlines() if not line.startswith("#"))
 
@@ -192,11 +192,11 @@ def packaged_rows(file_name: str) -> Iterator[list[str]]:
 @cache
 def _compositions() -> dict[str, tuple[float, dict[str, float]]]:
     """Density and mass fractions of the elements of each packaged material."""
-    found = {}
+    compositions = {}
     for name, density, fractions, _source in packaged_rows("materials.csv"):
         pairs = (pair.split(":") for pair in fractions.split())
-        found[name] = (float(density), {symbol: float(fraction) for symbol, fraction in pairs})
-    return found
+        compositions[name] = (float(density), {symbol: float(fraction) for symbol, fraction in pairs})
+    return compositions
 
 
 @cache
@@ -221,12 +221,12 @@ def _packaged_material(name: str) -> Material:
 
 @dataclass(frozen=True)
 class ElasticConstants:
-    """Of an isotropic elastic material.
+    """Elastic constants of an isotropic material.
 
     Attributes:
-        youngs_modulus: N/mm^2.
+        youngs_modulus: Young's modulus, N/mm^2.
         poisson: Poisson's ratio.
-        yield_stress: Where it begins to stay bent, N/mm^2.
+        yield_stress: Stress at which plastic deformation begins, N/mm^2.
     """
 
     youngs_modulus: float
@@ -241,22 +241,22 @@ class ElasticConstants:
 
 
 def elastic_constants(name: str) -> ElasticConstants:
-    """Of a packaged alloy, by the names that :func:`torchkcreg.physics.material` knows.
+    """Elastic constants of a packaged alloy, by its name as for `torchkcreg.physics.material`.
 
     Raises:
-        ValueError: If there is no such material, or none that implants are made of.
+        ValueError: If there is no such material, or its elastic constants are not packaged.
 
     >>> elastic_constants("Ti-6Al-4V").youngs_modulus
     114000.0
     """
     key = material(name).name
     if key not in _table():
-        raise ValueError(f"elastic constants are known of {', '.join(_table())}, not of {key}")
+        raise ValueError(f"elastic constants are available for {', '.join(_table())}, not for {key}")
     return _table()[key]
 
 
 def is_elastic(name: str) -> bool:
-    """Whether the elastic constants of a packaged material are known.
+    """True if the elastic constants of a material are packaged.
 
     Raises:
         ValueError: If there is no such material.

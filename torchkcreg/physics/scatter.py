@@ -1,5 +1,7 @@
-"""Broad scatter: two images from what is measured, with levels that a registration estimates, or a veil, a share of the
-primary, that is fitted to the air around an object and taken from projections.
+"""Broad scatter in radiographs.
+
+Either two scatter images computed from the measurement, whose levels a registration estimates, or a veil: a share of
+the blurred primary image, fitted to the air around an object and subtracted from projections.
 """
 
 from __future__ import annotations
@@ -14,21 +16,21 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from .blur import gaussian_blur
 
-_AIR_WITHIN_MM = 20.0  # on the detector, of its left and right border
+_AIR_WITHIN_MM = 20.0  # on the detector, beyond its left and right border
 _ITERATIONS = 40
-_SMOOTH_NODES = 6  # pixels a standard deviation that images are reduced to: a veil is smooth
+_SMOOTH_NODES = 6  # images are reduced to this many pixels per standard deviation, since a veil is smooth
 
 
 def scatter_shapes(transmission: Tensor, mask: Tensor, sigma_px: float) -> Tensor:
-    """How both kinds of scatter are spread over the detector, shape (2, V, rows, cols).
+    """Spatial distributions p and q of two kinds of scatter over the detector, shape (2, V, rows, cols).
 
-    Single scatter forward comes with the beam that passes, `p = G I` (Sun & Star-Lack 2010); what comes from the side
-    goes with what is removed on the way, `q = G (-I ln I)` (Ohnesorge et al. 1999). In front of a limb that stands in
-    the open beam the one falls where the other rises.
+    Single forward scatter is proportional to the transmitted beam, `p = G I` (Sun & Star-Lack 2010). Scatter from the
+    side depends on the intensity removed on the way, `q = G (-I ln I)` (Ohnesorge et al. 1999). Across a limb that is
+    surrounded by open beam, p falls where q rises.
 
     Args:
         transmission: Measured transmission I, shape (V, rows, cols).
-        mask: What share of each pixel counts, same shape.
+        mask: Weight of each pixel, same shape.
         sigma_px: Width of the Gaussian G, pixels.
     """
     passed = transmission.clamp(0, 1)
@@ -37,11 +39,11 @@ def scatter_shapes(transmission: Tensor, mask: Tensor, sigma_px: float) -> Tenso
 
 
 def scattered_signal(levels: Tensor, shapes: Tensor | None) -> Tensor:
-    """Scatter `s p + r q` of candidates in units of the open beam, a shape that broadcasts to (K, V, rows, cols).
+    """Scatter `s p + r q` of candidates, in units of the open beam; broadcasts to (K, V, rows, cols).
 
     Args:
-        levels: s and r, shape (K, 2).
-        shapes: p and q, shape (2, V, rows, cols); None: p is even, and q is nothing.
+        levels: Levels s and r, shape (K, 2).
+        shapes: Distributions p and q, shape (2, V, rows, cols). None: p is 1 everywhere and q is 0.
     """
     if shapes is None:
         return levels[:, 0, None, None, None]
@@ -50,17 +52,17 @@ def scattered_signal(levels: Tensor, shapes: Tensor | None) -> Tensor:
 
 @dataclass(frozen=True)
 class Veil:
-    """A broad, smooth share of the primary image that lies over it: scatter, or the detector's glare.
+    """Broad, smooth addition to the primary image, proportional to it: scatter or detector glare.
 
-    ``measured = primary + fraction * G primary`` with G a Gaussian blur; glare, which takes from the primary what it
-    gives, is the same up to the open beam's normalisation.
+    `measured = primary + fraction * G primary` with G a Gaussian blur. Glare takes from the primary what it
+    adds elsewhere, which is the same up to the open beam's normalisation.
 
     Attributes:
-        fraction: of the primary.
-        sigma_mm: standard deviation of the blur on the detector, mm.
+        fraction: Share of the primary.
+        sigma_mm: Standard deviation of the blur on the detector, mm.
 
     Raises:
-        ValueError: a negative fraction, one of 1 or more, or a blur that is not positive.
+        ValueError: If the fraction is negative or at least 1, or the blur is not positive.
     """
 
     fraction: float
@@ -74,14 +76,14 @@ class Veil:
 
 
 def veil_image(transmission: Tensor, veil: Veil, pixel_spacing: Sequence[float]) -> Tensor:
-    """What a veil adds to each pixel, (..., rows, cols), of measured transmissions I / I0.
+    """Veil signal in each pixel, (..., rows, cols), of measured transmissions I / I0.
 
-    Solves ``S = f G (I - S)`` by fixed-point iteration on images reduced to what the blur leaves of them.
+    Solves `S = f G (I - S)` by fixed-point iteration, on images reduced to the resolution that the blur leaves.
 
     Args:
-        transmission: measured intensity in units of the open beam, (..., rows, cols).
-        veil: its share and breadth.
-        pixel_spacing: (dv, du), mm.
+        transmission: Measured intensity in units of the open beam, (..., rows, cols).
+        veil: Its share and breadth.
+        pixel_spacing: Pixel spacing (dv, du), mm.
 
     >>> flat = torch.full((1, 32, 32), 1.2)
     >>> round(float(veil_image(flat, Veil(0.2), (4.0, 4.0))[0, 16, 16]), 4)
@@ -103,10 +105,10 @@ def veil_image(transmission: Tensor, veil: Veil, pixel_spacing: Sequence[float])
 
 
 def fixed_point_veil(measured: Tensor, fraction: float, sigma_px: float, pitch: float) -> Tensor:
-    """The veil (n, 1, rows, cols) of images with pixels of a pitch in mm.
+    """Veil (n, 1, rows, cols) of images whose pixels are `pitch` mm wide.
 
-    Above and below, the limb goes on; to the left and right of the detector there is air, if not at once: the primary
-    rises to 1 there over `_AIR_WITHIN_MM`.
+    Above and below the detector the limb is assumed to continue. To the left and right air is assumed: there the
+    primary rises to 1 over `_AIR_WITHIN_MM`.
     """
     veil = measured * (fraction / (1 + fraction))
     extra = max(1, min(math.ceil(2.5 * sigma_px), 4 * measured.shape[-1]))

@@ -1,4 +1,4 @@
-"""X-ray spectra as the detector weighs them: tungsten tubes, filters, energy-integrating CsI."""
+"""X-ray spectra weighted by the detector's response: tungsten tubes, filters, energy-integrating CsI."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ def effective_energies(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Energies and weights, at most `num_bins`, that reproduce `sum_k w_k exp(-sum_m mu_mk L_m)` within `tolerance`.
 
-    Both are fitted to the transmission of each material and of each pair of materials, from nothing down to a
-    transmission of 1e-6, in the least squares of relative errors: the weights by non-negative least squares inside, the
-    energies by a trust region outside (variable projection). Grouping by attenuation alone would need several times as
-    many bins. The number grows from three until the largest relative error on the fitted lengths is below `tolerance`.
+    Both are fitted to the transmission of each material and of each pair of materials, from 1 down to 1e-6, by least
+    squares of the relative errors (variable projection): an inner non-negative least squares for the weights, an outer
+    trust-region search for the energies. Grouping energies by attenuation alone would need several times as many bins.
+    The number of bins grows from three until the largest relative error on the fitted lengths is below `tolerance`.
 
     Args:
         energies_kev: Rising energies, keV.
         weights: Their weights, summing to one.
-        materials: Materials whose transmission is to be kept.
-        num_bins: The most energies that may come back.
+        materials: Materials whose transmission is to be reproduced.
+        num_bins: Largest number of energies.
         tolerance: Largest relative error of the transmission.
     """
     attenuations = np.stack([m.attenuation(energies_kev).numpy() for m in materials])
@@ -72,7 +72,7 @@ def effective_energies(
 
 
 def _fitted_lengths(attenuations: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Path lengths (n, materials) in mm: each material alone and in pairs, transmission from 1 to 1e-6."""
+    """Path lengths (n, materials), mm, of each material and each pair, for transmissions from 1 to 1e-6."""
     num_materials = len(attenuations)
     ranges = []
     for attenuation in attenuations:
@@ -93,14 +93,14 @@ def _fitted_lengths(attenuations: np.ndarray, weights: np.ndarray) -> np.ndarray
 
 @dataclass(frozen=True)
 class Spectrum:
-    """What share of the detector's signal each energy makes, with nothing in the beam.
+    """Share of each energy in the detected signal of the open beam.
 
     Attributes:
         energies_kev: Rising energies, keV.
-        weights: Detected energy at each of them; normalised to sum to one.
+        weights: Signal at each energy, normalised to sum to one.
 
     Raises:
-        ValueError: If the two do not pair, an energy does not rise, or a weight is negative.
+        ValueError: If their numbers differ, energies do not rise, or a weight is negative.
 
     >>> Spectrum((40.0, 60.0), (1.0, 3.0)).mean_energy
     55.0
@@ -127,21 +127,21 @@ class Spectrum:
         return float(np.dot(self.energies_kev, self.weights))
 
     def filtered(self, substance: Material, thickness_mm: float) -> Spectrum:
-        """The spectrum behind a filter (a negative thickness takes one away), normalised again."""
+        """Spectrum behind a filter, normalised again. A negative thickness removes filtration."""
         exponent = -substance.attenuation(self.energies_kev).numpy() * thickness_mm
         return Spectrum(self.energies_kev, tuple(np.array(self.weights) * np.exp(exponent - exponent.max())))
 
     def reduced(self, materials: Sequence[Material], num_bins: int = 20, *, tolerance: float = 2e-4) -> Spectrum:
-        """The fewest effective energies that keep the transmission of these materials, six or so for a 90 kV beam.
+        """Fewest effective energies that reproduce the transmission of these materials, about six for a 90 kV beam.
 
-        Aluminium is kept too, so that the result may be hardened or softened afterwards. The energies are real ones:
-        other materials' attenuation at them makes sense, with a slightly larger error.
+        Aluminium is always included, so that the result may be hardened or softened afterwards. The energies also serve
+        for other materials, with a slightly larger error.
 
         Args:
-            materials: What stands in the beam.
-            num_bins: The most bins that may come back.
-            tolerance: Largest relative error of the transmission, from 1 down to 1e-6, of each material and each two of
-                them; the accuracy is what `num_bins` allows where it is not reached.
+            materials: Materials in the beam.
+            num_bins: Largest number of energies.
+            tolerance: Largest relative error of the transmission, from 1 down to 1e-6, of each material and each pair.
+                It may be exceeded if `num_bins` is too small.
 
         Raises:
             ValueError: If `num_bins` is not positive.
@@ -150,9 +150,9 @@ class Spectrum:
             raise ValueError(f"num_bins must be positive, got {num_bins}")
         if len(self.energies_kev) <= 1:
             return self
-        kept = {substance.name: substance for substance in (*materials, material("aluminium"))}
+        unique = {substance.name: substance for substance in (*materials, material("aluminium"))}
         energies, weights = np.array(self.energies_kev), np.array(self.weights)
-        return Spectrum(*map(tuple, effective_energies(energies, weights, list(kept.values()), num_bins, tolerance)))
+        return Spectrum(*map(tuple, effective_energies(energies, weights, list(unique.values()), num_bins, tolerance)))
 
 
 def tungsten_spectrum(
@@ -162,19 +162,19 @@ def tungsten_spectrum(
     csi_mm: float = 0.6,
     anode_deg: float = PACKAGED_ANODE_DEG,
 ) -> Spectrum:
-    """Spectrum of a tungsten tube as a CsI detector absorbs it, weighted by energy.
+    """Spectrum of a tungsten tube as absorbed by a CsI detector, weighted by energy.
 
-    `w(E) = N(E) exp(-sum_f mu_f(E) t_f) (1 - exp(-mu_CsI(E) t)) E`, N from SpekPy 2 in bins of 1 keV: packaged for 70,
-    80, 90, 100, 110 and 120 kV and an anode of 12 degrees, else computed where SpekPy is installed.
+    `w(E) = N(E) exp(-sum_f mu_f(E) t_f) (1 - exp(-mu_CsI(E) t)) E`, with N from SpekPy 2 in bins of 1 keV. Packaged for
+    70, 80, 90, 100, 110 and 120 kV and an anode angle of 12 degrees; others are computed if SpekPy is installed.
 
     Args:
         kvp: Tube voltage, kV.
-        filtration_mm: Filters, material to mm; 2.5 mm of aluminium and 0.2 mm of copper where None.
+        filtration_mm: Thickness in mm of each filter material. None: 2.5 mm of aluminium and 0.2 mm of copper.
         csi_mm: Thickness of the scintillator, mm of solid CsI.
-        anode_deg: Angle of the anode.
+        anode_deg: Anode angle, degrees.
 
     Raises:
-        ValueError: If the voltage is not packaged and SpekPy is not installed, or a filter's material is unknown.
+        ValueError: If voltage or angle are not packaged and SpekPy is not installed, or a filter's material is unknown.
 
     >>> 50 < tungsten_spectrum(90).mean_energy < 60
     True
@@ -186,12 +186,12 @@ def tungsten_spectrum(
         exponent -= material(name).attenuation(energies).numpy() * thickness
     absorbed = -np.expm1(-material("csi").attenuation(energies).numpy() * csi_mm)
     weights = photons * np.exp(exponent) * absorbed * energies
-    kept = weights > NEGLIGIBLE_WEIGHT * weights.sum()
-    return Spectrum(tuple(energies[kept]), tuple(weights[kept]))
+    significant = weights > NEGLIGIBLE_WEIGHT * weights.sum()
+    return Spectrum(tuple(energies[significant]), tuple(weights[significant]))
 
 
 def _computed(kvp: float, anode_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Energies in keV and photons per keV before any filter, by SpekPy."""
+    """Energies in keV and photons per keV before any filter, computed by SpekPy."""
     try:
         import spekpy
     except ImportError:
@@ -204,8 +204,8 @@ def _computed(kvp: float, anode_deg: float) -> tuple[np.ndarray, np.ndarray]:
         span = f"{_LOWEST_KVP:g} to {_HIGHEST_KVP:g}"
         raise ValueError(f"kvp must lie within {span} and the anode's angle within 0 to 90, got {kvp:g}, {anode_deg:g}")
     energies, photons = spekpy.Spek(kvp=float(kvp), th=float(anode_deg), dk=1).get_spectrum()
-    kept = energies >= _LOWEST_KEV  # of the tables of attenuation
-    return np.asarray(energies)[kept], np.asarray(photons)[kept]
+    tabulated = energies >= _LOWEST_KEV  # where the attenuation tables begin
+    return np.asarray(energies)[tabulated], np.asarray(photons)[tabulated]
 
 
 @cache

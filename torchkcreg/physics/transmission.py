@@ -1,4 +1,4 @@
-"""What materials let through of a beam of several energies, blurred and averaged over pixels: one fused operation."""
+"""Transmission of a beam of several energies through materials, blurred and pooled, as one fused operation."""
 
 from __future__ import annotations
 
@@ -24,26 +24,25 @@ def transmission(
     pooling: int = 1,
     backend: str = "auto",
 ) -> Tensor:
-    """Transmitted share of the beam (K, V, rows / pooling, cols / pooling), by Beer and Lambert's law over energies.
+    """Transmitted share of the beam (K, V, rows / pooling, cols / pooling), by the Beer-Lambert law over energies.
 
-    ``T = pool(blur(sum_e w_e exp(-sum_m mu_me L_m)))``; only images of the size of the result are kept for the
-    gradient, whatever the number of energies.
+    `T = pool(blur(sum_e w_e exp(-sum_m mu_me L_m)))`. Only images of the size of the
+    result are stored for the gradient, whatever the number of energies.
 
     Args:
-        path_lengths: L in mm, (K, M, V, rows, cols).
-        attenuation: mu in 1/mm, (M, E).
-        weights: w, shape (E,), or whatever broadcasts to (K, V, E): spectra of views, or of candidates.
-        kernel: One-dimensional blur kernels, (K, odd), applied along rows and columns, the border repeated; none if not
-            given.
-        pooling: Blurred transmissions are averaged over squares of this many pixels a side.
+        path_lengths: Path lengths L, mm, (K, M, V, rows, cols).
+        attenuation: Linear attenuation mu, 1/mm, (M, E).
+        weights: Spectrum w, (E,), or spectra of views or candidates that broadcast to (K, V, E).
+        kernel: Blur kernels (K, odd), applied along rows and columns with the border repeated. None: no blur.
+        pooling: Edge of the squares of pixels over which blurred transmissions are averaged.
         backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
-        Differentiable in everything: first gradients by formulas of their own, all other derivatives by those of plain
-        torch, which keep an image for each energy.
+        Tensor, differentiable in all inputs. First gradients have fast kernels; all other derivatives use plain torch,
+        which stores one image per energy.
 
     Raises:
-        ValueError: If shapes do not fit.
+        ValueError: If shapes do not match.
 
     >>> water = torch.tensor([[0.02]])
     >>> transmission(torch.full((1, 1, 1, 1, 1), 50.0), water, torch.ones(1)).flatten()
@@ -71,7 +70,7 @@ def transmission(
 
 @dataclass(frozen=True)
 class _Transmission:
-    """The operation with what no derivative is asked of."""
+    """The operation with its non-differentiable setting."""
 
     pooling: int
 
@@ -79,15 +78,15 @@ class _Transmission:
         return TRANSMISSION.dispatched(*inputs, self.pooling)
 
     def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
-        found = TRANSMISSION_BACKWARD.dispatched(gradient, *inputs, self.pooling, needed[1])
-        return [g if need else None for g, need in zip(found, needed)]
+        gradients = TRANSMISSION_BACKWARD.dispatched(gradient, *inputs, self.pooling, needed[1])
+        return [g if need else None for g, need in zip(gradients, needed)]
 
     def reference(self, path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor) -> Tensor:
         return _transmitted(path_lengths, attenuation, weights, kernel, self.pooling)
 
 
 def _transmitted(path_lengths: Tensor, attenuation: Tensor, weights: Tensor, kernel: Tensor, pooling: int) -> Tensor:
-    """The definition, in plain torch."""
+    """Reference in plain torch."""
     exponents = torch.einsum("me,kmvij->kevij", attenuation, path_lengths)
     signal = torch.einsum("kve,kevij->kvij", weights, torch.exp(-exponents))
     return avg_pool2d(convolve_by(convolve_by(signal, kernel, -2), kernel, -1), pooling)
@@ -102,7 +101,7 @@ def _gradients(
     pooling: int,
     need_attenuation: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of the definition by autograd; that to the attenuation comes back empty where it is not needed."""
+    """Gradients of the reference by autograd. The one to the attenuation is empty if it is not needed."""
     inputs = [t.detach().requires_grad_(True) for t in (path_lengths, attenuation, weights, kernel)]
     with torch.enable_grad():
         result = _transmitted(inputs[0], inputs[1], inputs[2], inputs[3], pooling)

@@ -1,8 +1,8 @@
 """Projectors: path length in mm through an implant, for each pixel of each view.
 
-`project_points` draws a point cloud, node by node, with footprints that leave no stripes; `project_mesh` draws a closed
-triangle mesh, exactly. `project_volume` integrates a voxel volume along rays, `backproject` is its adjoint, and
-`backproject_weighted` what filtered back-projection needs.
+`project_points` splats the nodes of a point cloud with footprints that leave no stripes. `project_mesh` computes exact
+pixel averages for a closed triangle mesh. `project_volume` integrates a voxel volume along rays, `backproject` is its
+adjoint, and `backproject_weighted` is the weighted back-projection of FDK.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The image of one node: its projected cell, averaged over a pixel."""
+"""Footprints of nodes: the projected cell of a node, averaged over each pixel."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_NODES_PER_CENTROID = 32  # a block's centroid only has to be right within a millimetre or so
+_NODES_PER_CENTROID = 32  # enough for a block's centroid, which is needed to about a millimetre
 _MAX_TAPS = 64
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """Tabulated images of a node, one table for each view and each block of consecutive nodes.
+    """Tabulated footprints, one table for each view and each block of consecutive nodes.
 
     Args:
-        table: shape (V, num_blocks, R + 1, R + 1, T, T). Entry ``[view, block, pv, pu]`` holds the T x T pixel values
-            of a node of 1 mm^3 that sits ``pv / R`` and ``pu / R`` of a pixel beyond the pixel of tap ``T / 2 - 1``.
+        table: Shape (V, num_blocks, R + 1, R + 1, T, T). Entry `[view, block, pv, pu]` holds the T x T pixel values
+            of a node of 1 mm^3 located `pv / R` and `pu / R` of a pixel beyond the pixel of tap `T / 2 - 1`.
             The T x T taps sum to one at every phase.
-        block_size: how many consecutive nodes share a table; the last block may be shorter.
+        block_size: Number of consecutive nodes that share a table; the last block may be shorter.
     """
 
     table: Tensor
@@ -34,7 +34,7 @@ class Footprint:
 
     @property
     def phases(self) -> int:
-        """Number R of sub-pixel positions that are tabulated along each axis."""
+        """Number R of tabulated sub-pixel positions along each axis."""
         return self.table.shape[2] - 1
 
     @property
@@ -54,25 +54,25 @@ def cell_footprint(
 ) -> Footprint:
     """Footprint of the nodes of a lattice: the projection of their cell, box-filtered by the pixel.
 
-    Near a block's centroid a projection is affine, and takes the edges ``a_i`` of the cell to ``e_i = J a_i`` pixels.
-    The image of a homogeneous cell is then the box spline of ``e_1, e_2, e_3``, and its average over a pixel has the
-    Fourier transform ``prod_i sinc(f . e_i) * sinc(f_u) sinc(f_v)`` with f in cycles per pixel. Sampled at multiples of
-    ``1 / T`` and transformed back it gives the footprint at ``1 / R`` of a pixel. A box of ``2 / R`` pixels (Lanczos'
-    sigma factors) keeps the truncated series from ringing where cells are much smaller than pixels. Cells that tile
-    space have footprints that tile the image: no stripes.
+    Near a block's centroid the projection is approximately affine and maps the edges `a_i` of the cell to `e_i = J a_i`
+    in pixels. The image of a homogeneous cell is then the box spline of `e_1, e_2, e_3`. Its average over a pixel has
+    the Fourier transform `prod_i sinc(f . e_i) * sinc(f_u) sinc(f_v)` with f in cycles per pixel. Sampling
+    it at multiples of `1 / T` and transforming back gives the footprint at steps of `1 / R` pixel. Smoothing with a box
+    of `2 / R` pixels (Lanczos' sigma factors) avoids ringing of the truncated series where cells are much smaller than
+    pixels. Footprints of cells that tile space tile the image, so there are no stripes.
 
     Args:
-        points: nodes in world mm, shape (..., N, 3). Leading axes (candidates) are averaged.
-        cell: edge vectors of a node's cell in world mm, one in each row; or one such matrix for each block.
-        projection_matrices: shape (V, 3, 4), world mm to homogeneous pixels.
-        block_size: how many consecutive nodes share a table. Consecutive nodes should be neighbours in space.
-        phases: number R of tabulated sub-pixel positions along each axis.
+        points: Nodes in world mm, shape (..., N, 3). Positions are averaged over leading axes (candidates).
+        cell: Edge vectors of a node's cell in world mm, one per row; or one such matrix per block.
+        projection_matrices: World mm to homogeneous pixels, shape (V, 3, 4).
+        block_size: Number of consecutive nodes that share a table. Consecutive nodes should be neighbours in space.
+        phases: Number R of tabulated sub-pixel positions along each axis.
 
     Returns:
         The footprint, in the dtype and on the device of the points, without gradient.
 
     Raises:
-        ValueError: where shapes or devices don't fit, or cells project to more than 64 pixels.
+        ValueError: Shapes or devices do not fit, or cells project to more than 64 pixels.
 
     >>> P = torch.tensor([[[1000.0, 0, 0, 0], [0, 1000, 0, 0], [0, 0, 1, 500]]])
     >>> footprint = cell_footprint(torch.zeros(5, 3), 0.25 * torch.eye(3), P)
@@ -108,7 +108,7 @@ def _check(points: Tensor, cell: Tensor, matrices: Tensor, block_size: int, phas
 
 
 def _block_centroids(points: Tensor, block_size: int) -> Tensor:
-    """Approximate centroid (num_blocks, 3) of each block, over a few nodes of it and over all candidates."""
+    """Approximate centroid (num_blocks, 3) of each block, from a few of its nodes in all candidates."""
     num_nodes = points.shape[-2]
     num_samples = min(block_size, _NODES_PER_CENTROID)
     starts = torch.arange(0, num_nodes, block_size, device=points.device)
@@ -127,12 +127,12 @@ def _projected_edges(centroids: Tensor, cell: Tensor, matrices: Tensor) -> Tenso
     uv = pixels[..., :2] / depth
     jacobian = (linear[..., :2, :] - uv[..., None] * linear[..., 2:, :]) / depth[..., None]
     edges = cell @ jacobian.mT
-    # Blocks behind the source (or of NaN) are not drawn, so any footprint will do for them.
+    # Blocks behind the source (or with NaN) are not drawn, so their footprint does not matter.
     return torch.where((depth > 0)[..., None] & edges.isfinite(), edges, 0.0)
 
 
 def _num_taps(edges: Tensor, phases: int) -> int:
-    """The smallest of 4, 6, 8, 12, 16, 24, ... that holds the support of every footprint."""
+    """Smallest of 4, 6, 8, 12, 16, 24, ... that contains the support of every footprint."""
     width = float(edges.abs().sum(dim=2).amax()) + 1 + 2 / phases if edges.numel() else 0.0
     taps = 4
     while taps < width:
@@ -155,8 +155,8 @@ def _tabulate(edges: Tensor, taps: int, phases: int) -> Tensor:
 def _periodic_footprint(edges: Tensor, taps: int, phases: int) -> Tensor:
     """Footprints (n, T R, T R) at every 1 / R pixel, centred on entry 0 and repeated with a period of T pixels.
 
-    A footprint is symmetric about its node, so its transform F is real and even. With ``f_u, f_v >= 0`` and
-    ``F' = F(f_u, -f_v)`` the footprint at d is the sum of ``(F + F') cos cos - (F - F') sin sin`` over frequencies.
+    A footprint is symmetric about its node, so its transform F is real and even. With `f_u, f_v >= 0` and
+    `F' = F(f_u, -f_v)` the footprint at d is the sum of `(F + F') cos cos - (F - F') sin sin` over frequencies.
     """
     even, odd, angle_u, angle_v = _transform(taps, phases, edges.dtype, edges.device)
     signs = edges.new_tensor([[1.0, 1.0], [1.0, -1.0]])[:, None, None]
@@ -167,9 +167,9 @@ def _periodic_footprint(edges: Tensor, taps: int, phases: int) -> Tensor:
 
 
 def _sinc(edge: Tensor, angle_u: Tensor, angle_v: Tensor) -> Tensor:
-    """``sin(x) / x`` for x = pi f . e with edges e (..., 2), shape (..., f_v, f_u)."""
+    """`sin(x) / x` for x = pi f . e with edges e (..., 2), shape (..., f_v, f_u)."""
     angle = edge[..., 1, None, None] * angle_v + edge[..., 0, None, None] * angle_u
-    angle += 1e-20  # changes nothing but a zero, where sin(x) / x is one
+    angle += 1e-20  # makes sin(x) / x one at zero and changes nothing else
     return torch.sin(angle).div_(angle)
 
 
@@ -189,10 +189,10 @@ def _transform(taps: int, phases: int, dtype: torch.dtype, device: torch.device)
 
 @functools.lru_cache(maxsize=8)
 def _tap_index(taps: int, phases: int, device: torch.device) -> Tensor:
-    """Where entry (pv, pu, tv, tu) of a table lies in a flattened periodic footprint."""
+    """Indices of the table entries (pv, pu, tv, tu) in a flattened periodic footprint."""
     size = taps * phases
     phase = torch.arange(phases + 1, device=device)
     first = phases * (taps // 2 - 1 - torch.arange(taps, device=device))
-    # Node minus pixel, which by symmetry does as well as pixel minus node.
+    # Node minus pixel; by symmetry the same as pixel minus node.
     index = (phase[:, None] + first) % size
     return (index[:, None, :, None] * size + index[None, :, None, :]).flatten()

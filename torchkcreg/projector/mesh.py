@@ -1,4 +1,4 @@
-"""Path lengths through closed triangle meshes, averaged exactly over each pixel."""
+"""Path lengths through closed triangle meshes, averaged exactly over each pixel, and their kernel operators."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from .mesh_reference import integrate_triangles
 def project_mesh(
     vertices: Tensor, faces: Tensor, projection_matrices: Tensor, det_shape: tuple[int, int], *, backend: str = "auto"
 ) -> Tensor:
-    """Path lengths in mm through a closed mesh, `(..., V, rows, cols)`, each the average over its pixel.
+    """Path lengths in mm through a closed mesh, `(..., V, rows, cols)`, averaged over each pixel.
 
-    A ray's chord is the sum over the triangles it meets of the distance from the source, negative where it enters and
-    positive where it leaves. In detector coordinates this distance is `|M^-1 (u, v, 1)| / w`, with w = 1 / depth affine
-    over a projected triangle. Each projected triangle is clipped to each pixel's square (Sutherland and Hodgman 1974)
-    and 1 / w integrated over what is left, to the fourth power of its variation there; `|M^-1 (u, v, 1)|` is taken at
-    the pixel's centre. A triangle that leaves the detector loses just that part. Computed in float64.
+    A ray's chord is the sum over all triangles it hits of the distance from the source, negative where the ray enters
+    and positive where it leaves. In detector coordinates this distance is `|M^-1 (u, v, 1)| / w`, with w = 1 / depth
+    affine over a projected triangle. Each projected triangle is clipped to each pixel's square (Sutherland and Hodgman
+    1974) and 1 / w is integrated over the clipped polygon, to fourth order in its variation there; `|M^-1 (u, v, 1)|`
+    is taken at the pixel's centre. Only the parts of triangles on the detector count. Computed in float64.
 
-    The result is differentiable in the vertices and the matrices, moving silhouettes included: a silhouette sweeps
-    over pixel area continuously, which chords through pixel centres do not see.
+    The result is differentiable in the vertices and the matrices, including moving silhouettes, which chords
+    through pixel centres alone would miss.
 
     Args:
         vertices: Vertices in mm, `(..., n, 3)`.
-        faces: Vertex indices `(m, 3)` of a closed mesh, counter-clockwise seen from outside (inside out: negative
-            lengths). An open mesh gives nonsense of the size of the depth.
+        faces: Vertex indices `(m, 3)` of a closed mesh, counter-clockwise seen from outside (otherwise
+            lengths are negative). An open mesh gives errors of the order of the depth.
         projection_matrices: `(V, 3, 4)`, world mm to homogeneous pixels, the last row giving the depth in mm.
         det_shape: Rows and columns of the detector.
         backend: "auto", "cpp" or "torch".
 
     Raises:
-        ValueError: If a shape or an index is wrong, or a vertex is not in front of the source.
+        ValueError: A shape or an index is wrong, or a vertex is not in front of the source.
 
     >>> import trimesh
     >>> box = trimesh.creation.box((10.0, 20.0, 30.0))
@@ -66,14 +66,14 @@ def project_mesh(
 
 
 def _signed_depths(projected: Tensor, faces: Tensor, det_shape: tuple[int, int], backend: str) -> Tensor:
-    """The images of projected vertices (B, n, 3): (B, rows, cols)."""
+    """Integrals of the signed depths (B, rows, cols) for projected vertices (B, n, 3)."""
     if choose_backend(projected, backend, operator=MESH_LENGTHS.name).is_reference:
         return integrate_triangles(projected, faces, *det_shape)
     return differentiable(_MeshKernel(faces, det_shape), projected)
 
 
 class _MeshKernel:
-    """The kernel of one mesh and detector; its derivatives by `torchkcreg.kernels.differentiable`."""
+    """Kernel for one mesh and detector, differentiable by `torchkcreg.kernels.differentiable`."""
 
     def __init__(self, faces: Tensor, det_shape: tuple[int, int]) -> None:
         self._faces, self._det_shape = faces, det_shape
@@ -89,7 +89,7 @@ class _MeshKernel:
 
 
 def _gradient(gradient: Tensor, projected: Tensor, faces: Tensor) -> Tensor:
-    """The gradient by autograd."""
+    """Gradient with respect to the projected vertices, by autograd through the reference."""
     leaf = projected.detach().requires_grad_(True)
     with torch.enable_grad():
         images = integrate_triangles(leaf, faces, *gradient.shape[-2:])
@@ -97,7 +97,7 @@ def _gradient(gradient: Tensor, projected: Tensor, faces: Tensor) -> Tensor:
 
 
 def _distance_per_depth(matrix: Tensor, det_shape: tuple[int, int]) -> Tensor:
-    """Distance from the source per depth at each pixel's centre, with the sign of the axes' handedness."""
+    """Ratio of distance from the source to depth at each pixel centre, signed by the handedness of the axes."""
     rows, cols = (torch.arange(size, dtype=matrix.dtype, device=matrix.device) for size in det_shape)
     inverse = torch.linalg.inv(matrix[:, :3])
     rays = inverse[:, 0] * cols[None, :, None] + inverse[:, 1] * rows[:, None, None] + inverse[:, 2]
@@ -105,7 +105,7 @@ def _distance_per_depth(matrix: Tensor, det_shape: tuple[int, int]) -> Tensor:
 
 
 def _check_arguments(vertices: Tensor, faces: Tensor, projection_matrices: Tensor, det_shape: tuple[int, int]) -> None:
-    """Raise ValueError unless shapes and indices fit."""
+    """Raise ValueError if shapes or indices do not fit."""
     if vertices.dim() < 2 or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape (..., n, 3), got {tuple(vertices.shape)}")
     if faces.dim() != 2 or faces.shape[1] != 3:

@@ -1,4 +1,4 @@
-"""Signed depths of projected triangles integrated over each pixel, in readable torch: what the kernels compute."""
+"""Signed depths of projected triangles integrated over each pixel: the reference in torch for the kernels."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from torch.utils.checkpoint import checkpoint
 
 from torchkcreg.kernels.differentiable import is_transformed
 
-MAX_PAIRS = 1 << 20  # (triangle, pixel) pairs looked at together
-MAX_CLIPPED_PAIRS = 1 << 14  # pairs clipped together: what they need stays in a core's cache
+MAX_PAIRS = 1 << 20  # (triangle, pixel) pairs processed at once
+MAX_CLIPPED_PAIRS = 1 << 14  # pairs clipped at once, so that their data fit in a core's cache
 
 
 def integrate_triangles(projected: Tensor, faces: Tensor, rows: int, cols: int) -> Tensor:
-    """Sums over triangles of the signed depth, integrated over each pixel: (B, rows, cols).
+    """Sums over triangles of the signed depth integrated over each pixel, (B, rows, cols).
 
     Args:
         projected: Vertices (B, n, 3) as u, v, w = 1 / depth; pixel (row, col) is [col, col + 1] x [row, row + 1].
         faces: Vertex indices (m, 3).
         rows: Rows of the detector.
-        cols: Its columns.
+        cols: Columns of the detector.
     """
     images = [_integrate(shape, faces, (rows, cols)) for shape in projected]
     return torch.stack(images) if images else projected.new_zeros(0, rows, cols)
 
 
 def _integrate(projected: Tensor, faces: Tensor, det_shape: tuple[int, int]) -> Tensor:
-    """One image (rows, cols)."""
+    """Image (rows, cols) of one set of projected vertices (n, 3)."""
     rows, cols = det_shape
     corners = projected.index_select(0, faces.flatten()).reshape(-1, 3, 3)
     image = corners.new_zeros(rows * cols)
@@ -47,7 +47,7 @@ def _integrate(projected: Tensor, faces: Tensor, det_shape: tuple[int, int]) -> 
 
 
 def _pairs(corners: Tensor, det_shape: tuple[int, int]) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Triangle, row and column of every pair of a triangle and a pixel of its bounding box, in chunks."""
+    """Pairs of a triangle and a pixel of its bounding box as (triangle, row, column), in chunks."""
     rows, cols = det_shape
     low, high = corners[:, :, :2].amin(1).floor(), corners[:, :, :2].amax(1).floor() + 1
     limits = corners.new_tensor([cols, rows])
@@ -67,12 +67,12 @@ def _pairs(corners: Tensor, det_shape: tuple[int, int]) -> Iterator[tuple[Tensor
 
 
 def _classify(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> tuple[Tensor, Tensor]:
-    """Which pairs' pixels lie wholly inside their triangle, and which may be cut by its outline."""
+    """Masks of pairs whose pixel is wholly inside the triangle, and of pairs that its outline may cut."""
     u, v = corners[..., 0], corners[..., 1]
     du, dv = u.roll(-1, 1) - u, v.roll(-1, 1) - v
     orientation = (du[:, 0] * dv[:, 1] - dv[:, 0] * du[:, 1]).sign()[:, None]
     du, dv = du * orientation, dv * orientation
-    # an edge's function is positive inside; over a pixel it varies by +-(|du| + |dv|) / 2 about its centre
+    # edge functions are positive inside; over a pixel they vary by +-(|du| + |dv|) / 2 about their centre value
     constant, spread = du * v - dv * u, (du.abs() + dv.abs()) / 2
     centre_u, centre_v = col + 0.5, row + 0.5
     inside = (orientation[:, 0] != 0)[triangle]
@@ -86,7 +86,7 @@ def _classify(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> tu
 
 
 def _whole_pixels(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """Mean signed depth of triangles over pixels that they cover."""
+    """Mean signed depth of triangles over pixels that they cover completely."""
     used, triangle = torch.unique(triangle, return_inverse=True)
     origin, first, second = corners.index_select(0, used).unbind(1)
     first, second = first - origin, second - origin
@@ -101,12 +101,12 @@ def _whole_pixels(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -
 
 
 def _cut_pixels(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """Signed depth of triangles integrated over their part of a pixel."""
+    """Signed depth of triangles integrated over the part of the pixel that they cover."""
     polygon = corners.index_select(0, triangle)
     zero = torch.zeros_like(col)
     polygon = polygon - torch.stack([col, row, zero], dim=1).to(polygon)[:, None]
     for axis in (0, 1):
-        # an edge on the border of two pixels is the second's, for the triangles on either side of it
+        # an edge on the border of two pixels counts for the second, for the triangles on both sides of the edge
         polygon = _clip(polygon, polygon[..., axis], polygon[..., axis] >= 0)
         polygon = _clip(polygon, 1 - polygon[..., axis], polygon[..., axis] < 1)
     u, v, w = polygon.unbind(-1)
@@ -116,20 +116,20 @@ def _cut_pixels(corners: Tensor, triangle: Tensor, row: Tensor, col: Tensor) -> 
     return (area * _mean_reciprocal(first_w, w[:, 1:-1], w[:, 2:])).sum(1)
 
 
-def _clip(polygon: Tensor, height: Tensor, kept: Tensor) -> Tensor:
-    """Convex polygons (P, k, 3) cut where their vertices' height (P, k) is zero: (P, k + 1, 3), the last repeated.
+def _clip(polygon: Tensor, height: Tensor, is_inside: Tensor) -> Tensor:
+    """Clip convex polygons (P, k, 3) where the height (P, k) of their vertices is zero; the result is (P, k + 1, 3).
 
-    The result is the vertices inside, the crossing where the outline leaves, as often as fills the row, and the one
-    where it comes back. Polygons wholly outside collapse to no area.
+    The result lists the inside vertices, the crossing where the outline leaves (repeated to fill the row), and the
+    crossing where it re-enters. Polygons wholly outside collapse to zero area.
     """
     size = polygon.shape[1]
-    number = kept.sum(1, keepdim=True)
-    entering = kept & ~kept.roll(1, 1)
+    number = is_inside.sum(1, keepdim=True)
+    entering = is_inside & ~is_inside.roll(1, 1)
     start = entering.to(torch.uint8).argmax(1, keepdim=True)  # 0 where the outline never leaves
     steps = torch.arange(size, device=polygon.device)
-    order = (start + steps) % size  # inside vertices first, then those outside
+    order = (start + steps) % size  # inside vertices first, then outside ones
     points = polygon.gather(1, order[..., None].expand_as(polygon))
-    heights, inside = height.gather(1, order), kept.gather(1, order)
+    heights, inside = height.gather(1, order), is_inside.gather(1, order)
     last = (number - 1).clamp_min(0)
     leaves = _crossing(points, heights, inside, last, (last + 1).clamp_max(size - 1))
     enters = _crossing(points, heights, inside, torch.full_like(last, size - 1), torch.zeros_like(last))
@@ -138,20 +138,21 @@ def _clip(polygon: Tensor, height: Tensor, kept: Tensor) -> Tensor:
     return torch.cat([body, closing], dim=1)
 
 
-def _crossing(points: Tensor, heights: Tensor, kept: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """Points (P, 1, 3) where the edge between two vertices crosses height zero."""
+def _crossing(points: Tensor, heights: Tensor, is_inside: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
+    """Points (P, 1, 3) where the edge between two vertices (given by index) crosses height zero."""
     a, b = (points.gather(1, index[..., None].expand(-1, -1, 3)) for index in (inside, outside))
     h_a, h_b = heights.gather(1, inside), heights.gather(1, outside)
-    crosses = kept.gather(1, inside) != kept.gather(1, outside)
+    crosses = is_inside.gather(1, inside) != is_inside.gather(1, outside)
     share = h_a / torch.where(crosses, h_a - h_b, torch.ones_like(h_a))
     return a + torch.where(crosses, share, torch.zeros_like(share))[..., None] * (b - a)
 
 
 def _mean_reciprocal(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Mean of 1 / w over a triangle where w is affine with values a, b, c at its corners.
+    """Mean of 1 / w over a triangle, for w affine with values a, b, c at the corners.
 
-    A series in w's deviation from its mean m: `1/m (1 + E2/m^2 - E3/m^3 + E4/m^4)`, with the triangle's moments
-    `E2 = -e2/6, E3 = e3/10, E4 = e2^2/15` from the elementary symmetric polynomials of the corners' deviations.
+    Computed as a series in the deviation of w from its mean m: `1/m (1 + E2/m^2 - E3/m^3 + E4/m^4)`, with the
+    triangle's moments `E2 = -e2/6, E3 = e3/10, E4 = e2^2/15` from the elementary symmetric polynomials of the corners'
+    deviations.
     """
     mean = (a + b + c) / 3
     a, b, c = a / mean - 1, b / mean - 1, c / mean - 1

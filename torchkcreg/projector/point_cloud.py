@@ -1,4 +1,4 @@
-"""The DRR of a point cloud: path length in mm through nodes that each stand for a small cell of metal."""
+"""DRRs of a point cloud: path length in mm through nodes that each represent a small cell of metal."""
 
 from __future__ import annotations
 
@@ -25,35 +25,36 @@ def project_points(
 ) -> Tensor:  # (..., V, rows, cols)
     """Path length in mm through a point cloud, averaged over each pixel, for each view and candidate.
 
-    A node of volume ``V_n`` at depth d spreads its footprint, which sums to one over the pixels, with the amplitude
-    ``V_n |det M| |M^-1 (u, v, 1)| / d^2`` where ``P = [M | m]``. That is ``V_n`` times the squared ratio of the
-    distances from source to pixel and from source to node, over pixel area times the cosine of the obliquity. So the
-    DRR of a lattice that fills a body is the body's path length. Nodes behind the source or with NaN coordinates are
-    skipped, and a footprint that leaves the detector loses just that part.
+    A node of volume `V_n` at depth d adds its footprint, which sums to one over the pixels, with the amplitude
+    `V_n |det M| |M^-1 (u, v, 1)| / d^2` where `P = [M | m]`. This is `V_n` times the squared ratio of the
+    distances source-pixel and source-node, divided by pixel area times cosine of the obliquity. The DRR of a lattice
+    that fills a body is therefore the body's path length. Nodes behind the source or with NaN coordinates are skipped.
+    Parts of footprints outside the detector are dropped.
 
-    Differentiable in points, volumes and projection matrices, in both modes and any order; the shape of the footprint
-    counts as constant, and it is piecewise bilinear: second derivatives are those between its kinks. Under
-    `torch.autocast` it computes in float32. The images have the dtype of the points, whatever that of the matrices.
+    Differentiable in points, volumes and projection matrices, in forward and reverse mode and to any order. The shape
+    of the footprint is taken as constant. It is piecewise bilinear, so second derivatives are those between its kinks.
+    Under `torch.autocast` it computes in float32. The images have the dtype of the points, also if the
+    matrices have another.
 
     Args:
-        points: nodes in world mm, shape (..., N, 3); leading axes are candidates. Neighbours in memory should be
-            neighbours in space (Morton order): that makes footprints exact and the projection fast.
-        volumes: volume of each node in mm^3, shape (N,).
-        projection_matrices: shape (V, 3, 4), world mm to homogeneous 0-based pixels; row 2 yields the depth in mm.
-        det_shape: (rows, cols) of the detector.
-        cell: edge vectors (rows) of the cell that a node stands for, in world mm; one matrix, or one for each block of
-            8192 nodes. Either `cell` or `footprint`.
-        footprint: ready-made, to reuse for poses up to some 5 degrees off: the path lengths stay right, stripes stay
-            below 0.2 %.
-        backend: "auto" (C++ on a CPU, Triton on a GPU, torch where they cannot be had), or one of them: "cpp",
-            "triton", "torch". All give the same numbers up to rounding.
+        points: Nodes in world mm, shape (..., N, 3); leading axes are candidates. Neighbours in memory should be
+            neighbours in space (Morton order), which makes footprints accurate and the projection fast.
+        volumes: Volume of each node in mm^3, shape (N,).
+        projection_matrices: World mm to homogeneous 0-based pixels, shape (V, 3, 4); row 2 gives the depth in mm.
+        det_shape: Detector size (rows, cols).
+        cell: Edge vectors (rows) of a node's cell in world mm; one matrix, or one for each block of 8192 nodes. Give
+            either `cell` or `footprint`.
+        footprint: Precomputed footprint. It can be reused for poses up to about 5 degrees away: path lengths stay right
+            and stripes stay below 0.2 %.
+        backend: "auto" (C++ on a CPU, Triton on a GPU, torch where they are not available), "cpp", "triton" or
+            "torch". All give the same numbers up to rounding.
 
     Returns:
-        Path lengths in mm, shape (..., V, rows, cols), same bits for every number of threads.
+        Path lengths in mm, shape (..., V, rows, cols), bitwise the same for any number of threads.
 
     Raises:
-        ValueError: where shapes, dtypes or devices don't fit, or the backend doesn't exist.
-        OSError: for ``backend="cpp"`` where the C++ kernels can't be had.
+        ValueError: Shapes, dtypes or devices do not fit, or the backend does not exist.
+        OSError: With `backend="cpp"`, if the C++ kernels are not available.
 
     >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])  # 1000 px of focal length
     >>> line = torch.arange(-4.875, 5, 0.25)
@@ -63,7 +64,7 @@ def project_points(
     0.5
     """
     _check_points(points, volumes, projection_matrices, det_shape)
-    choose_backend(points, backend, operator=POINT_DRR.name)  # a wrong name should not wait for the footprint
+    choose_backend(points, backend, operator=POINT_DRR.name)  # rejects a wrong name before the footprint is computed
     if footprint is None and cell is not None:
         footprint = cell_footprint(points, cell, projection_matrices)
     elif footprint is None or cell is not None:
@@ -82,21 +83,21 @@ def project_points(
         backend=backend,
     )
     factors = pixel_factors(projection_matrices, det_shape, dtype=points.dtype)
-    images = images * factors if factors.requires_grad else images.mul_(factors)  # spares a copy of all images
+    images = images * factors if factors.requires_grad else images.mul_(factors)  # in place: avoids copying all images
     return images.reshape(*points.shape[:-2], *images.shape[1:])
 
 
 def pixel_factors(projection_matrices: Tensor, det_shape: tuple[int, int], *, dtype: torch.dtype) -> Tensor:
-    """``|det M| |M^-1 (u, v, 1)|`` of each pixel, shape (V, rows, cols), where ``P = [M | m]``.
+    """`|det M| |M^-1 (u, v, 1)|` of each pixel, shape (V, rows, cols), where `P = [M | m]`.
 
-    ``|M^-1 (u, v, 1)|`` is the length of the ray from the source over its depth, one over the cosine of the obliquity.
-    Its square is a quadratic polynomial in u and v, and evaluated as such.
+    `|M^-1 (u, v, 1)|` is the ratio of ray length to depth, 1 / cosine of the obliquity. Its square is evaluated as a
+    quadratic polynomial in u and v.
     """
     rows, cols = det_shape
     device = projection_matrices.device
     linear = projection_matrices[:, :, :3].to(torch.float64)
     gram = torch.linalg.inv(linear @ linear.mT) * torch.linalg.det(linear).square()[:, None, None]
-    gram = gram.to(dtype)[..., None, None]  # large from here on, and no cancellation to speak of
+    gram = gram.to(dtype)[..., None, None]  # from here on values are large, without significant cancellation
     u = torch.arange(cols, dtype=dtype, device=device)
     v = torch.arange(rows, dtype=dtype, device=device)[:, None]
     along_u = (gram[:, 0, 0] * u + 2 * gram[:, 0, 2]) * u + gram[:, 2, 2]
@@ -137,9 +138,9 @@ class PointCloudProjector(nn.Module):
     """DRRs of a point cloud in the views of a geometry; `project_points` as a module.
 
     Args:
-        geometry: anything with ``projection_matrices`` (V, 3, 4) and ``det_shape`` (rows, cols), a
-            ``ConeBeamGeometry`` for one. A module moves with this one.
-        backend: "auto", "cpp", "triton" or "torch".
+        geometry: Object with `projection_matrices` (V, 3, 4) and `det_shape` (rows, cols), such as a
+            `ConeBeamGeometry`. If it is a module it becomes a submodule.
+        backend: As in `project_points`: "auto", "cpp", "triton" or "torch".
     """
 
     def __init__(self, geometry, *, backend: str = "auto") -> None:
@@ -163,4 +164,5 @@ class PointCloudProjector(nn.Module):
         )
 
     def extra_repr(self) -> str:
+        """Backend for `repr`."""
         return f"backend={self.backend!r}"

@@ -1,4 +1,4 @@
-"""The point-cloud DRR as an operator with its derivatives; kernels are in ``csrc/cpu/point_drr.cpp``."""
+"""Point-cloud DRR as an operator with derivatives; the C++ kernels are in `csrc/cpu/point_drr.cpp`."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def point_drr(
     *,
     backend: str = "auto",
 ) -> Tensor:
-    """Images (B, V, rows, cols) of nodes spread by their footprints; see `reference.splat_points` for the arguments.
+    """Images (B, V, rows, cols) of nodes splatted with their footprints; arguments as in `splat_points`.
 
     Raises:
-        ValueError: for a backend that does not exist or does not serve the device of the points.
-        OSError: for a backend whose kernels cannot be had.
+        ValueError: The backend does not exist or does not support the points' device.
+        OSError: The backend's kernels are not available.
     """
     kernel = _PointDrr(table, block_size, rows, cols)
     if choose_backend(points, backend, operator=POINT_DRR.name).is_reference:
@@ -39,7 +39,7 @@ def point_drr(
 
 @dataclass(frozen=True)
 class _PointDrr:
-    """The operator with what no derivative is asked of."""
+    """The operator with its non-differentiable arguments bound."""
 
     table: Tensor
     block_size: int
@@ -50,8 +50,8 @@ class _PointDrr:
         return POINT_DRR.dispatched(points, volumes, matrices, self.table, self.block_size, self.rows, self.cols)
 
     def pullback(self, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
-        found = POINT_DRR_BACKWARD.dispatched(gradient, *inputs, self.table, self.block_size, *needed[1:])
-        return [g if need else None for g, need in zip(found, needed)]
+        gradients = POINT_DRR_BACKWARD.dispatched(gradient, *inputs, self.table, self.block_size, *needed[1:])
+        return [result if need else None for result, need in zip(gradients, needed)]
 
     def reference(self, points: Tensor, volumes: Tensor, matrices: Tensor) -> Tensor:
         return splat_points(points, volumes, matrices, self.table, self.block_size, self.rows, self.cols)
@@ -67,12 +67,12 @@ def _splat_gradients(
     need_volumes: bool,
     need_matrices: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of `splat_points` by autograd; one that is not needed comes back empty."""
+    """Gradients of `splat_points` by autograd; gradients that are not needed are empty tensors."""
     rows, cols = grad.shape[-2:]
-    here, there, views = (t.detach().requires_grad_(True) for t in (points, volumes, matrices))
+    point_leaf, volume_leaf, matrix_leaf = (t.detach().requires_grad_(True) for t in (points, volumes, matrices))
     with torch.enable_grad():
-        images = splat_points(here, there, views, table, block_size, rows, cols)
-    to_points, to_volumes, to_matrices = torch.autograd.grad(images, (here, there, views), grad)
+        images = splat_points(point_leaf, volume_leaf, matrix_leaf, table, block_size, rows, cols)
+    to_points, to_volumes, to_matrices = torch.autograd.grad(images, (point_leaf, volume_leaf, matrix_leaf), grad)
     return (
         to_points,
         to_volumes if need_volumes else to_volumes.new_empty(0),

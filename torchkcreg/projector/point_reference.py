@@ -1,11 +1,11 @@
-"""The point-cloud DRR in plain torch: the readable definition that every other backend has to match."""
+"""Point-cloud DRR in plain torch: the reference that all other backends must match."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-MIN_DEPTH = 1e-3  # mm; nothing stands nearer to the focal spot, and its amplitude would overflow
+MIN_DEPTH = 1e-3  # mm; nearer nodes are skipped, as their amplitude would overflow
 
 
 def splat_points(
@@ -17,14 +17,14 @@ def splat_points(
     rows: int,
     cols: int,
 ) -> Tensor:
-    """Images (B, V, rows, cols) of nodes that each spread ``volume / depth^2`` over the taps of their footprint.
+    """Images (B, V, rows, cols) of nodes that each distribute `volume / depth^2` over their footprint.
 
-    A node at pixel (u, v) reaches the T x T pixels from ``floor(u) - T / 2 + 1`` and ``floor(v) - T / 2 + 1`` on. Their
-    values are the bilinear interpolation of the table in the node's sub-pixel position. Nodes behind the source or with
-    NaN coordinates are skipped; pixels beyond the detector are lost.
+    A node at pixel (u, v) contributes to T x T pixels, starting at `floor(u) - T / 2 + 1` and `floor(v) - T / 2 + 1`.
+    Their values are interpolated bilinearly in the table at the node's sub-pixel position. Nodes behind the source or
+    with NaN coordinates are skipped; pixels outside the detector are dropped.
 
-    Differentiable in points, volumes and matrices by autograd; the table is a constant. Any device; on a GPU the order
-    of the sums, so the last bits, may differ from run to run.
+    Differentiable in points, volumes and matrices by autograd; the table is constant. Runs on any device. On a GPU the
+    order of summation, and so the last bits, may vary between runs.
     """
     images = []
     for candidate in points:
@@ -50,7 +50,7 @@ def _splat_view(
             value = value + (share_v * share_u)[:, None, None] * corner
     value = value * (volumes[node] / depth**2)[:, None, None]
 
-    # A frame of T pixels around the image takes what falls beside it, so that no tap needs a bounds check.
+    # A margin of T pixels around the image collects taps outside it, so that no tap needs a bounds check.
     tap = torch.arange(taps, device=points.device)
     width = cols + 2 * taps
     pixel = (row + taps)[:, None, None] * width + (col + taps)[:, None, None] + tap[:, None] * width + tap
@@ -77,7 +77,7 @@ def _pixel_coordinates(points: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _tap_position(coordinate: Tensor, taps: int, phases: int) -> tuple[Tensor, Tensor, Tensor]:
-    """First pixel that a node reaches, lower tabulated phase, and the weight of the upper one."""
+    """First pixel that a node contributes to, the lower tabulated phase, and the weight of the upper phase."""
     below = coordinate.detach().floor()
     position = (coordinate - below) * phases
     phase = position.detach().long().clamp(max=phases - 1)

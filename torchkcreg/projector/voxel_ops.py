@@ -1,4 +1,4 @@
-"""The voxel projector as operators with their derivatives; kernels are in ``csrc/cpu/voxel_*.cpp``."""
+"""Voxel projector and back-projectors as operators with derivatives; the C++ kernels are `csrc/cpu/voxel_*.cpp`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _Map = Callable[[Tensor], Tensor]
 
 
 def voxel_project(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols: int, *, backend: str) -> Tensor:
-    """Path integrals (B, V, rows, cols) of volume (B, D, H, W); see `voxel_reference` for rays and spacing."""
+    """Path integrals (B, V, rows, cols) of a volume (B, D, H, W); rays and spacing as in `voxel_reference`."""
     depth, height, width = volume.shape[-3:]
     project, backproject = _projector(volume, rays, spacing, (rows, cols), (depth, height, width), backend)
     return linear(volume, project, backproject)
@@ -24,7 +24,7 @@ def voxel_project(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols
 def voxel_backproject(
     images: Tensor, rays: Tensor, spacing: Tensor, shape: tuple[int, int, int], *, backend: str
 ) -> Tensor:
-    """The adjoint of `voxel_project`: images (B, V, rows, cols) into (B, D, H, W)."""
+    """Adjoint of `voxel_project`: images (B, V, rows, cols) into (B, D, H, W)."""
     rows, cols = images.shape[-2:]
     project, backproject = _projector(images, rays, spacing, (rows, cols), shape, backend)
     return linear(images, backproject, project)
@@ -33,10 +33,10 @@ def voxel_backproject(
 def voxel_backproject_weighted(
     images: Tensor, matrices: Tensor, shape: tuple[int, int, int], *, backend: str
 ) -> Tensor:
-    """Sum over views of the image over the squared depth, (B, D, H, W); see `voxel_weighted_reference`."""
+    """Sum over views of image / depth^2, (B, D, H, W); see `voxel_reference.backproject_by_voxels`."""
     rows, cols = images.shape[-2:]
     apply = kernel(VOXEL_BACKPROJECT_WEIGHTED, images, backend)
-    # Nothing iterates with this gradient, so it has no kernel of its own.
+    # This gradient is not used in iterations, so it has no kernel.
     return linear(
         images,
         lambda data: apply(data, matrices, *shape),
@@ -47,7 +47,7 @@ def voxel_backproject_weighted(
 def _projector(
     data: Tensor, rays: Tensor, spacing: Tensor, det_shape: tuple[int, int], shape: tuple[int, int, int], backend: str
 ) -> tuple[_Map, _Map]:
-    """The projector and its adjoint, each other's gradient."""
+    """The projector and its adjoint; each is the gradient of the other."""
     project, backproject = (kernel(op, data, backend) for op in (VOXEL_PROJECT, VOXEL_BACKPROJECT))
     return (
         lambda volume: project(volume, rays, spacing, *det_shape),
@@ -61,7 +61,7 @@ VOXEL_PROJECT = Operator(
     reference=project_by_planes,
     fake=lambda volume, rays, spacing, rows, cols: volume.new_empty(len(volume), len(rays), rows, cols),
 )
-# Its adjoint: images (B, V, rows, cols) -> (B, depth, height, width)
+# adjoint: images (B, V, rows, cols) -> (B, depth, height, width)
 VOXEL_BACKPROJECT = Operator(
     "voxel_backproject(Tensor images, Tensor rays, Tensor spacing, int depth, int height, int width) -> Tensor",
     reference=lambda images, rays, spacing, *shape: backproject_by_planes(images, rays, spacing, shape),

@@ -1,11 +1,14 @@
-"""Joseph's projector through voxels in plain torch: the readable definition that every other backend has to match.
+"""Voxel projector, its adjoint and weighted back-projection in plain torch: the reference for all other backends.
 
-Everything here is in voxel indices, x, y, z order. A view is a matrix ``[D | s]`` of shape (3, 4): the source is at
-``s`` and the ray of pixel (u, v) runs along ``d = D (u, v, 1)``, at depth t at ``s + t d``.
+Positions are voxel indices in x, y, z order. For the projector and its adjoint a view is a matrix `[D | s]` of shape
+(3, 4): the source is at `s`, the ray of pixel (u, v) has the direction `d = D (u, v, 1)`, and its point at depth t is
+`s + t d`.
 
 Joseph 1982, "An improved algorithm for reprojecting rays through pixel images": a ray is sampled where it crosses the
-lattice planes of its major axis, the one along which its index changes most, by bilinear interpolation in the plane.
-Beyond the outermost centres a value fades to zero over one voxel, so every voxel counts in full.
+lattice planes of its major axis (the axis along which its voxel index changes most), by bilinear interpolation in the
+plane. Beyond the outermost voxel centres values fade to zero over one voxel, so every voxel counts in full.
+
+The weighted back-projection is voxel-driven: it interpolates the images where voxel centres project to.
 """
 
 from __future__ import annotations
@@ -15,13 +18,13 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-AXIS_BIAS = (1.0, 1.0 - 1e-6, 1.0 - 2e-6)  # at 45 degrees rounding must not choose the major axis
-SAMPLES_AT_ONCE = 1 << 20  # bounds the memory; changes sums in the last bits at most
-VOXELS_AT_ONCE = 1 << 19  # bounds the memory
+AXIS_BIAS = (1.0, 1.0 - 1e-6, 1.0 - 2e-6)  # so that rounding does not decide the major axis at 45 degrees
+SAMPLES_AT_ONCE = 1 << 20  # limits memory; affects at most the last bits of sums
+VOXELS_AT_ONCE = 1 << 19  # limits memory
 
 
 def project_by_planes(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols: int) -> Tensor:
-    """Path integrals (B, V, rows, cols) of volume (B, D, H, W); rays (V, 3, 4) and spacing (3,) in float64."""
+    """Path integrals (B, V, rows, cols) of a volume (B, D, H, W); rays (V, 3, 4) and spacing (3,) in float64."""
     values, (depth, height, width) = volume.flatten(1), volume.shape[1:]
     images = volume.new_zeros(len(volume), len(rays), rows * cols)
     for view, ray in enumerate(rays):
@@ -32,7 +35,7 @@ def project_by_planes(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, 
 
 
 def backproject_by_planes(images: Tensor, rays: Tensor, spacing: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """The adjoint of `project_by_planes`: images (B, V, rows, cols) into (B, D, H, W)."""
+    """Adjoint of `project_by_planes`: images (B, V, rows, cols) into (B, D, H, W)."""
     rows, cols = images.shape[2:]
     volume = images.new_zeros(len(images), shape[0] * shape[1] * shape[2])
     for view, ray in enumerate(rays):
@@ -45,7 +48,7 @@ def backproject_by_planes(images: Tensor, rays: Tensor, spacing: Tensor, shape: 
 def _samples(
     ray: Tensor, spacing: Tensor, shape: tuple[int, int, int], rows: int, cols: int
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """What a view adds up: pixels (n,), the voxels (planes, 4, n) that they see and with which weights, part by part.
+    """Samples of a view in parts: pixels (n,), the voxels (planes, 4, n) on their rays, and the voxels' weights.
 
     Pixels and voxels are indices of flattened arrays; weights are in mm.
     """
@@ -60,22 +63,22 @@ def _samples(
             continue
         direction = directions[:, pixels]
         step = lengths[pixels] / direction[axis].abs()  # mm between two planes
-        others = [other for other in range(3) if other != axis]
+        minor_axes = [minor for minor in range(3) if minor != axis]
         planes_at_once = max(1, SAMPLES_AT_ONCE // (4 * len(pixels)))
         for plane in torch.arange(counts[axis], device=ray.device).split(planes_at_once):
             distance = plane[:, None] - source[axis]
             ahead = distance * direction[axis] > 0  # a ray starts at the source
             voxels, weights = plane[:, None, None] * strides[axis], (step * ahead)[:, None]
-            for other in others:
-                position = source[other] + distance * (direction[other] / direction[axis])
-                index, share = _neighbours(position, counts[other])
-                voxels = (voxels[:, :, None] + index[:, None] * strides[other]).flatten(1, 2)
+            for minor in minor_axes:
+                position = source[minor] + distance * (direction[minor] / direction[axis])
+                index, share = _neighbours(position, counts[minor])
+                voxels = (voxels[:, :, None] + index[:, None] * strides[minor]).flatten(1, 2)
                 weights = (weights[:, :, None] * share[:, None]).flatten(1, 2)
             yield pixels, voxels, weights
 
 
 def pixel_directions(ray: Tensor, rows: int, cols: int) -> Tensor:
-    """Directions (3, rows * cols) of the rays of a view at depth 1."""
+    """Vectors (3, rows * cols) from the source to depth 1 along the rays of a view."""
     u = torch.arange(cols, dtype=ray.dtype, device=ray.device)
     v = torch.arange(rows, dtype=ray.dtype, device=ray.device)[:, None]
     return (ray[:, 0, None, None] * u + ray[:, 1, None, None] * v + ray[:, 2, None, None]).flatten(1)
@@ -84,7 +87,7 @@ def pixel_directions(ray: Tensor, rows: int, cols: int) -> Tensor:
 def _neighbours(position: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """The two lattice points around each position (planes, n) and their linear weights, both (planes, 2, n).
 
-    Points beyond the lattice have weight 0 and an index that is safe to read.
+    Points outside the lattice have weight 0 and a valid index.
     """
     below = position.clamp(-2, count + 1).floor()
     fraction = position - below
@@ -95,10 +98,10 @@ def _neighbours(position: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def backproject_by_voxels(images: Tensor, matrices: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """``sum over views of image(u, v) / depth^2`` at each voxel, (B, D, H, W), from images (B, V, rows, cols).
+    """Weighted back-projection (B, D, H, W): sum over views of `image(u, v) / depth^2`, images (B, V, rows, cols).
 
     Images are interpolated bilinearly and fade to zero over one pixel beyond the outermost pixel centres. Voxels behind
-    the source get nothing.
+    the source get zero.
     """
     rows, cols = images.shape[2:]
     volume = images.new_zeros(len(images), shape[0] * shape[1] * shape[2])
@@ -110,7 +113,7 @@ def backproject_by_voxels(images: Tensor, matrices: Tensor, shape: tuple[int, in
 
 
 def spread_over_images(volume: Tensor, matrices: Tensor, rows: int, cols: int) -> Tensor:
-    """The adjoint of `backproject_by_voxels`: volume (B, D, H, W) into (B, V, rows, cols)."""
+    """Adjoint of `backproject_by_voxels`: volume (B, D, H, W) into (B, V, rows, cols)."""
     _, depth, height, width = volume.shape
     shape = (depth, height, width)
     images = volume.new_zeros(len(volume), len(matrices), rows * cols)
@@ -149,7 +152,7 @@ def _pixels_around(homogeneous: Tensor, rows: int, cols: int) -> list[tuple[Tens
 
 
 def _linear(position: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
-    """The two pixels around each position and their weights, 0 beyond the image."""
+    """The two pixels around each position and their linear weights, 0 outside the image."""
     position = position.clamp(-2, count + 1)
     below = position.floor()
     pairs = ((below, below + 1 - position), (below + 1, position - below))

@@ -29,27 +29,28 @@ def project_volume(
 
     A ray is sampled where it crosses the lattice planes of the axis along which its voxel index changes most, by
     bilinear interpolation in the plane (Joseph, IEEE Trans. Med. Imaging 1(3), 1982), and starts at the source. Beyond
-    the outermost voxel centres the volume fades to zero over one voxel, so that every voxel counts in full; what is
-    outside the grid is air, and a ray that misses it is zero.
+    the outermost voxel centres the volume fades to zero over one voxel, so that every voxel counts in full. Outside the
+    grid the volume is zero, and so is the integral of a ray that misses the grid.
 
-    Differentiable in the volume, any number of times: the gradient is `backproject`. The matrices count as constant.
+    Differentiable in the volume, to any order; the gradient is `backproject`. The matrices are taken as constant.
 
     Args:
-        volume: values, 1/mm for line integrals of attenuation, shape (..., D, H, W); leading axes are candidates.
-        grid: where its voxels are; any direction.
-        projection_matrices: shape (V, 3, 4), world mm to homogeneous 0-based pixels; any invertible left part, any
-            scale. The side of the source on which the grid's centre is counts as the front.
-        det_shape: (rows, cols) of the detector.
-        backend: "auto" (C++ on a CPU, Triton on a GPU, torch where they cannot be had), or one of them: "cpp",
-            "triton", "torch". All give the same numbers up to rounding.
+        volume: Voxel values, shape (..., D, H, W), in 1/mm for line integrals of attenuation; leading axes are
+            candidates.
+        grid: Grid of the volume, with any direction.
+        projection_matrices: World mm to homogeneous 0-based pixels, shape (V, 3, 4), with an invertible left part and
+            any scale. The grid's centre is taken to be in front of the source.
+        det_shape: Detector size (rows, cols).
+        backend: "auto" (C++ on a CPU, Triton on a GPU, torch where they are not available), "cpp", "triton" or
+            "torch". All give the same numbers up to rounding.
 
     Returns:
-        Images of the volume's dtype, shape (..., V, rows, cols), same bits for every number of threads.
+        Images of the volume's dtype, shape (..., V, rows, cols), bitwise the same for any number of threads.
 
     Raises:
-        ValueError: where shapes, dtypes or devices don't fit, matrices are not finite, not invertible or require a
-            gradient, or the backend doesn't exist.
-        OSError: for ``backend="cpp"`` where the C++ kernels can't be had.
+        ValueError: Shapes, dtypes or devices do not fit, matrices are not finite, not invertible or require a gradient,
+            or the backend does not exist.
+        OSError: With `backend="cpp"`, if the C++ kernels are not available.
 
     >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])  # 1000 px of focal length
     >>> grid = VolumeGrid.centered((10, 20, 20), 0.5)
@@ -74,25 +75,25 @@ def backproject(
     *,
     backend: str = "auto",
 ) -> Tensor:  # (..., D, H, W)
-    """The adjoint of `project_volume`: for each voxel the sum of all pixels, weighted as the pixels see the voxel.
+    """Adjoint of `project_volume`: for each voxel the sum over pixels with the weights of the projector.
 
-    ``<project_volume(x), y> = <x, backproject(y)>`` up to rounding. Differentiable in the projections; the gradient is
-    `project_volume`. A subset of views is a slice of both (``projections[..., 3::10, :, :]``, ``matrices[3::10]``),
-    which copies no images.
+    `<project_volume(x), y> = <x, backproject(y)>` up to rounding. Differentiable in the projections; the gradient is
+    `project_volume`. To use a subset of views, slice both arguments (`projections[..., 3::10, :, :]`,
+    `matrices[3::10]`); this copies no images.
 
     Args:
-        projections: images, shape (..., V, rows, cols).
-        grid: the voxels to fill.
-        projection_matrices: shape (V, 3, 4), as for `project_volume`.
+        projections: Images, shape (..., V, rows, cols).
+        grid: Grid of the result.
+        projection_matrices: As for `project_volume`, shape (V, 3, 4).
         backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
-        Volume of the projections' dtype, shape (..., D, H, W), zero where no ray passes; same bits for every number of
-        threads.
+        Volume of the projections' dtype, shape (..., D, H, W), zero where no ray passes; bitwise the same for any
+        number of threads.
 
     Raises:
-        ValueError: as `project_volume`.
-        OSError: as `project_volume`.
+        ValueError: As for `project_volume`.
+        OSError: As for `project_volume`.
 
     >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])
     >>> grid = VolumeGrid.centered((10, 20, 20), 0.5)
@@ -113,26 +114,26 @@ def backproject_weighted(
     *,
     backend: str = "auto",
 ) -> Tensor:  # (..., D, H, W)
-    """Voxel-driven back-projection with FDK's weight: ``sum over views of image(u, v) / depth^2``, depth in mm.
+    """Voxel-driven back-projection with FDK's weight: `sum over views of image(u, v) / depth^2`, depth in mm.
 
-    The image is interpolated bilinearly where the centre of the voxel projects to, and fades to zero over one pixel
-    beyond the outermost pixel centres. Voxels behind the source get nothing. Not the adjoint of `project_volume`: it
-    is what inversion formulas need (Feldkamp, Davis, Kress, J. Opt. Soc. Am. A 1(6), 1984).
+    The image is interpolated bilinearly at the projection of the voxel's centre, and fades to zero over one pixel
+    beyond the outermost pixel centres. Voxels behind the source get zero. This is not the adjoint of `project_volume`
+    but the back-projection of inversion formulas (Feldkamp, Davis, Kress, J. Opt. Soc. Am. A 1(6), 1984).
 
     Differentiable in the projections.
 
     Args:
-        projections: filtered images, shape (..., V, rows, cols).
-        grid: the voxels to fill.
-        projection_matrices: shape (V, 3, 4), as for `project_volume`.
+        projections: Filtered images, shape (..., V, rows, cols).
+        grid: Grid of the result.
+        projection_matrices: As for `project_volume`, shape (V, 3, 4).
         backend: "auto", "cpp", "triton" or "torch".
 
     Returns:
-        Volume of the projections' dtype, shape (..., D, H, W), same bits for every number of threads.
+        Volume of the projections' dtype, shape (..., D, H, W), bitwise the same for any number of threads.
 
     Raises:
-        ValueError: as `project_volume`.
-        OSError: as `project_volume`.
+        ValueError: As for `project_volume`.
+        OSError: As for `project_volume`.
 
     >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])
     >>> volume = backproject_weighted(torch.ones(1, 65, 65), VolumeGrid((1, 1, 1)), P)
@@ -147,12 +148,12 @@ def backproject_weighted(
 
 
 class VolumeProjector(nn.Module):
-    """Path integrals of a grid's volumes in the views of a geometry, and the adjoint; `project_volume` as a module.
+    """Path integrals of volumes in the views of a geometry, and the adjoint; `project_volume` as a module.
 
     Args:
-        geometry: anything with ``projection_matrices`` (V, 3, 4) and ``det_shape`` (rows, cols), a
-            ``ConeBeamGeometry`` for one. A module moves with this one.
-        grid: where the voxels are.
+        geometry: Object with `projection_matrices` (V, 3, 4) and `det_shape` (rows, cols), such as a
+            `ConeBeamGeometry`. If it is a module it becomes a submodule.
+        grid: Grid of the volumes.
         backend: "auto", "cpp", "triton" or "torch".
 
     >>> from torchkcreg.geometry import circular_geometry
@@ -170,11 +171,11 @@ class VolumeProjector(nn.Module):
         self.backend = backend
 
     def forward(self, volume: Tensor, *, views: Views = None) -> Tensor:
-        """Images (..., n, rows, cols) of a volume (..., D, H, W) in n views, all of them if `views` is None."""
+        """Images (..., n, rows, cols) of a volume (..., D, H, W) in the n selected views, by default all."""
         return project_volume(volume, self.grid, self._matrices(views), self.geometry.det_shape, backend=self.backend)
 
     def adjoint(self, projections: Tensor, *, views: Views = None) -> Tensor:
-        """Volume (..., D, H, W) from the images (..., n, rows, cols) of n views; see `backproject`."""
+        """Volume (..., D, H, W) from images (..., n, rows, cols) of the n selected views; see `backproject`."""
         matrices = self._matrices(views)
         if tuple(projections.shape[-2:]) != tuple(self.geometry.det_shape):
             rows, cols = self.geometry.det_shape
@@ -195,13 +196,14 @@ class VolumeProjector(nn.Module):
         return matrices[chosen]
 
     def extra_repr(self) -> str:
+        """Grid and backend for `repr`."""
         return f"grid={self.grid}, backend={self.backend!r}"
 
 
 def _rays(grid: VolumeGrid, matrices: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:
-    """``[D | s]`` of each view in voxel indices, (V, 3, 4), and the voxel spacing (3,), both in float64.
+    """`[D | s]` of each view in voxel indices, (V, 3, 4), and the voxel spacing (3,), both in float64.
 
-    With ``Q = [M | q]`` the matrix from voxel index to pixel, ``D = M^-1`` and ``s = -M^-1 q``.
+    If `Q = [M | q]` maps voxel indices to pixels, `D = M^-1` and `s = -M^-1 q`.
     """
     checked = _checked_matrices(grid, matrices, data)
     to_pixels = checked @ grid.voxel_to_world.to(checked.device)
@@ -220,7 +222,7 @@ def _checked_matrices(grid: VolumeGrid, matrices: Tensor, data: Tensor) -> Tenso
         raise ValueError(f"projection_matrices must be on the data's device {data.device}, got {matrices.device}")
     if matrices.requires_grad:
         raise ValueError("projection_matrices must not require a gradient: they count as constant, detach them")
-    matrices = matrices.double().contiguous()  # another layout may round otherwise
+    matrices = matrices.double().contiguous()  # another memory layout may round differently
     if not bool(matrices.isfinite().all()):
         raise ValueError("projection_matrices must be finite")
     normals = matrices[:, :, :3].norm(dim=-1, keepdim=True)
@@ -234,8 +236,8 @@ def _checked_matrices(grid: VolumeGrid, matrices: Tensor, data: Tensor) -> Tenso
 
 
 def _flat(data: Tensor) -> Tensor:
-    """The data with all leading axes in one, for the last three."""
-    return data.reshape(math.prod(data.shape[:-3]), *data.shape[-3:])  # -1 is refused where there are no elements
+    """The data with all axes before the last three flattened to one."""
+    return data.reshape(math.prod(data.shape[:-3]), *data.shape[-3:])  # -1 fails for tensors without elements
 
 
 def _flat_images(projections: Tensor, num_views: int) -> Tensor:

@@ -1,8 +1,9 @@
 """Reconstruction: filtered back-projection, penalised weighted least squares, known components.
 
-`fdk` for one or several focal spots; `pwls` with ordered subsets and momentum; `prepare` turns measured transmissions
-into line integrals and weights, with known components (KC-Rec), scatter and beam hardening accounted for; `inpainted`
-is the fast way around known metal (KC-MAR).
+`fdk` is filtered back-projection for one or several focal spots. `pwls` is iterative, with ordered subsets and
+momentum. `prepare` turns measured transmissions into line integrals and weights, corrected for known components
+(KC-Rec), scatter and beam hardening. `inpainted` is the fast alternative: it interpolates across the shadow of known
+metal (KC-MAR).
 """
 
 from torchkcreg.physics import Veil, veil_image

@@ -20,10 +20,10 @@ class AxialFrame:
 
     Attributes:
         angles: (V,) gantry angles of the sources, radians.
-        radii: (V,) distances from source to axis, mm.
+        radii: (V,) source-to-axis distances, mm.
         heights: (V,) heights of the sources, mm.
-        to_virtual: (V, 3, 3) homographies from pixels (u, v, 1) to homogeneous mm on the virtual detector: (p, zeta),
-            p across and zeta up from the central ray.
+        to_virtual: (V, 3, 3) homographies from pixels (u, v, 1) to homogeneous positions (p, zeta) in mm on the virtual
+            detector, p across and zeta up from the central ray.
     """
 
     angles: Tensor
@@ -33,12 +33,12 @@ class AxialFrame:
 
 
 def axial_frame(geometry: ConeBeamGeometry) -> AxialFrame:
-    """The frame of a geometry whose sources turn about the world's z axis.
+    """Frame of a geometry whose sources rotate about the world's z axis.
 
-    A gantry that turns about another axis is brought there by ``geometry.moved``.
+    If the gantry rotates about another axis, align it first with `geometry.moved`.
 
     Raises:
-        ValueError: a source on the axis of rotation.
+        ValueError: If a source lies on the axis of rotation.
     """
     sources = geometry.source_positions.double()
     radii = sources[:, :2].norm(dim=1)
@@ -52,17 +52,17 @@ def axial_frame(geometry: ConeBeamGeometry) -> AxialFrame:
 
 def _axes(sources: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Unit vectors (V, 3): across (towards growing angle), up, and from the source to the axis."""
-    zero, one = torch.zeros_like(radii), torch.ones_like(radii)
+    zeros, ones = torch.zeros_like(radii), torch.ones_like(radii)
     cosine, sine = sources[:, 0] / radii, sources[:, 1] / radii
     return (
-        torch.stack([-sine, cosine, zero], dim=1),
-        torch.stack([zero, zero, one], dim=1),
-        torch.stack([-cosine, -sine, zero], dim=1),
+        torch.stack([-sine, cosine, zeros], dim=1),
+        torch.stack([zeros, zeros, ones], dim=1),
+        torch.stack([-cosine, -sine, zeros], dim=1),
     )
 
 
 def is_aligned(frame: AxialFrame, det_shape: tuple[int, int]) -> bool:
-    """Whether rows and columns lie along the virtual detector's everywhere, within a hundredth of a pixel."""
+    """True if rows and columns are parallel to the virtual detector's to within a hundredth of a pixel."""
     corners = _corners(det_shape).to(frame.to_virtual)
     exact = _apply(frame.to_virtual, corners)
     linear = frame.to_virtual / frame.to_virtual[:, 2:, 2:]
@@ -74,7 +74,7 @@ def is_aligned(frame: AxialFrame, det_shape: tuple[int, int]) -> bool:
 
 
 def columns_and_rows(frame: AxialFrame, det_shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Positions in mm of the columns (V, cols) and rows (V, rows) of an aligned detector on the virtual one."""
+    """Positions of an aligned detector's columns (V, cols) and rows (V, rows) on the virtual detector, mm."""
     linear = frame.to_virtual / frame.to_virtual[:, 2:, 2:]
     u = torch.arange(det_shape[1], dtype=torch.float64, device=linear.device)
     v = torch.arange(det_shape[0], dtype=torch.float64, device=linear.device)
@@ -82,10 +82,11 @@ def columns_and_rows(frame: AxialFrame, det_shape: tuple[int, int]) -> tuple[Ten
 
 
 def rectified(geometry: ConeBeamGeometry) -> tuple[ConeBeamGeometry, Callable[[Tensor, Sequence[int]], Tensor]]:
-    """The geometry of virtual detectors, and what resamples images (..., v, rows, cols) of some views onto them.
+    """Geometry of the virtual detectors, and a function that resamples images (..., v, rows, cols) of views onto them.
 
-    For tilted detectors: FDK filters along lines across the axis. The virtual detectors have the mean pixel of the real
-    ones and hold all of them; beyond its border an image goes on with its last pixels.
+    Needed for tilted detectors, because FDK filters along lines perpendicular to the axis. The virtual detectors have
+    the mean pixel size of the real ones and are large enough to contain all of them. Outside the real detector, images
+    are extended with their border pixels.
     """
     frame = axial_frame(geometry)
     corners = _apply(frame.to_virtual, _corners(geometry.det_shape).to(frame.to_virtual))
@@ -100,7 +101,7 @@ def rectified(geometry: ConeBeamGeometry) -> tuple[ConeBeamGeometry, Callable[[T
     back = torch.linalg.inv(frame.to_virtual)
 
     def resampled(images: Tensor, views: Sequence[int]) -> Tensor:
-        found = []
+        images_out = []
         for number, view in enumerate(views):
             pixels = virtual @ back[view].mT
             size = pixels.new_tensor([cols, rows])
@@ -109,8 +110,8 @@ def rectified(geometry: ConeBeamGeometry) -> tuple[ConeBeamGeometry, Callable[[T
             sampled = grid_sample(
                 image, places[None].to(image), mode="bilinear", padding_mode="border", align_corners=False
             )
-            found.append(sampled.reshape(*images.shape[:-3], *counts[::-1]))
-        return torch.stack(found, dim=-3)
+            images_out.append(sampled.reshape(*images.shape[:-3], *counts[::-1]))
+        return torch.stack(images_out, dim=-3)
 
     return _virtual_geometry(geometry, frame, low, high, pitch, counts), resampled
 
@@ -130,12 +131,12 @@ def _virtual_geometry(
 
 
 def _corners(det_shape: tuple[int, int]) -> Tensor:
-    """Centres (4, 3) of the corner pixels: first, along u, along v, opposite."""
+    """Centres (4, 3) of the corner pixels: first, end of u, end of v, opposite."""
     rows, cols = float(det_shape[0] - 1), float(det_shape[1] - 1)
     return torch.tensor([[0.0, 0.0, 1.0], [cols, 0.0, 1.0], [0.0, rows, 1.0], [cols, rows, 1.0]], dtype=torch.float64)
 
 
 def _apply(homographies: Tensor, pixels: Tensor) -> Tensor:
-    """Positions (V, n, 2) of homogeneous pixels (n, 3)."""
+    """Positions (V, n, 2) to which the homographies map homogeneous pixels (n, 3)."""
     moved = pixels @ homographies.mT
     return moved[..., :2] / moved[..., 2:]

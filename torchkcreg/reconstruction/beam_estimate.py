@@ -1,4 +1,4 @@
-"""A beam that nobody knows, out of the shadow of known metal (after Xu et al. 2017, Poly-KCR)."""
+"""Estimation of an unknown beam spectrum from the shadow of known metal (after Xu et al. 2017, Poly-KCR)."""
 
 from __future__ import annotations
 
@@ -29,37 +29,37 @@ from .system import VoxelSystem, projected
 
 FEWEST_PIXELS = 200
 MOST_PIXELS = 5000
-LEAST_MM = 0.5  # of metal in a pixel that is used
-LEAST_PER_MM = 0.1  # attenuation of the lightest implant alloys, 1/mm, less than that
-STEEPEST = 0.15  # change of the metal's length to the next pixel, as a share: rims are averages of exponentials
-LEAST_TRANSMISSION = 0.003  # below it nothing is left of the beam that tells anything
-BACKGROUND = 0.03  # of a line integral: the interpolated background's error
-NOISE = 2e-3  # of a transmission
-NEAR_MODE = 0.06  # of water: what is taken for the same tissue
-TISSUE_RANGE = (0.85, 1.15)  # of water: what most of an object is beyond that is no soft tissue
-TUBE_KVP = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0)  # packaged spectra, from among which the nearest is taken
+LEAST_MM = 0.5  # of metal in a pixel, for the pixel to be used
+LEAST_PER_MM = 0.1  # 1/mm, below the attenuation of the lightest implant alloys
+STEEPEST = 0.15  # relative change of the metal path to the next pixel: at edges a pixel averages exponentials
+LEAST_TRANSMISSION = 0.003  # below it the signal holds no information on the beam
+BACKGROUND = 0.03  # error of the interpolated background's line integral
+NOISE = 2e-3  # of the transmission
+NEAR_MODE = 0.06  # relative to water: attenuation range counted as the same tissue
+TISSUE_RANGE = (0.85, 1.15)  # relative to water: the most frequent attenuation outside this range is not soft tissue
+TUBE_KVP = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0)  # of the packaged spectra, of which the best is chosen
 NUM_BINS = 12
-INDEPENDENT = 400  # pixels: what is wrong with the background or the scatter is so over many of them
-# standard deviations of what is likely before the data speak
-HARDNESS_MM = 2.0  # of aluminium, of a scanner's filter beside the packaged spectra's
-SCALE = 0.03  # of an alloy's attenuation
-UNLIKELY = 3.0  # so many of these are told
-SCATTER = 0.05  # of the scatter that was fitted to the air
-TISSUE = 0.02  # of the attenuation of the soft tissue that most of an object is, beside water
-KNOWN_TISSUE = 0.003  # of the same, where it is known
+INDEPENDENT = 400  # effective number of independent pixels: background and scatter errors extend over many pixels
+# standard deviations of the priors
+HARDNESS_MM = 2.0  # of aluminium: the scanner's filter minus the packaged spectra's
+SCALE = 0.03  # of an alloy's relative attenuation
+UNLIKELY = 3.0  # standard deviations from the prior beyond which a warning is given
+SCATTER = 0.05  # relative error of the scatter fitted to the air
+TISSUE = 0.02  # of the attenuation of the predominant soft tissue relative to water
+KNOWN_TISSUE = 0.003  # the same, if the attenuation is given
 
 
 @dataclass(frozen=True)
 class MetalShadow:
-    """Pixels behind metal: path lengths (M, N); all others (N,). And what stands around the metal."""
+    """Pixels behind metal: path lengths (M, N), all others (N,); and attenuation around the metal."""
 
     lengths: Tensor
     primary: Tensor
     scatter: Tensor
-    background: Tensor  # its line integrals
+    background: Tensor  # line integrals of the background
     deviation: Tensor  # of the primary
-    typical: float  # line integral around the metal, as measured
-    tissue: float  # what most of the object is, over water, if the beam is `start`; nan where it is no soft tissue
+    typical: float  # median measured line integral around the metal
+    tissue: float  # most frequent attenuation relative to water, for beam `start`; nan if not soft tissue
     start: BeamModel
 
 
@@ -74,15 +74,15 @@ def metal_shadow(
     mask: Tensor | None,
     backend: str,
 ) -> MetalShadow:
-    """Pixels behind smooth metal, and the background in them out of a reconstruction around the metal's shadow."""
+    """Pixels behind smooth metal; the background is reconstructed from data inpainted across the metal's shadow."""
     lines = floored_line_integrals(primary)
     everything = [(slice(None), beam.weights[:, None, None, None])]
     around = inpainted(without_components(lines, everything, beam)[0], metal, mask=mask)
     volume = fdk(around, geometry, grid, backend=backend).clamp_min(0)
     system = VoxelSystem(geometry, grid, backend=backend)
-    seen, displaced = projected(system, volume), projected(system, volume * (1 - unknown))
-    # what the volume lacks is as around the shadow, and where there is metal there is nothing else
-    background = seen + inpainted(around - seen, metal, mask=mask) - displaced
+    reprojected, displaced = projected(system, volume), projected(system, volume * (1 - unknown))
+    # add the reprojection error interpolated from around the shadow; subtract the background displaced by metal
+    background = reprojected + inpainted(around - reprojected, metal, mask=mask) - displaced
     total = metal.sum(0)
     steps = max_pool2d(total[:, None], 3, 1, 1)[:, 0] + max_pool2d(-total[:, None], 3, 1, 1)[:, 0]
     behind = torch.exp(-background) * torch.exp(-LEAST_PER_MM * total)
@@ -92,7 +92,7 @@ def metal_shadow(
     places = used.flatten().nonzero()[:, 0]
     if len(places) < FEWEST_PIXELS:
         raise ValueError(
-            f"only {len(places)} pixels lie behind smooth metal, too few to tell the beam: give a spectrum"
+            f"only {len(places)} pixels lie behind smooth metal, too few to estimate the beam: give a spectrum"
         )
     places = places[:: max(1, len(places) // MOST_PIXELS)]
     at = lambda image: image.flatten()[places].double()  # noqa: E731
@@ -110,7 +110,7 @@ def metal_shadow(
 
 
 def _tissue(volume: Tensor, water: float) -> float:
-    """What most of an object is, over water; nan where that is no soft tissue."""
+    """Most frequent attenuation in the object, relative to water; nan if it is not soft tissue."""
     low, high = 0.5, 2.0
     counts = torch.histc(volume / water, bins=150, min=low, max=high)
     counts = torch.nn.functional.avg_pool1d(counts[None], 5, 1, 2)[0]
@@ -123,20 +123,20 @@ def _tissue(volume: Tensor, water: float) -> float:
 
 @dataclass(frozen=True)
 class BeamEstimate:
-    """What the metal's shadow told of the beam and of the metal.
+    """Beam and metal attenuation estimated from the metal's shadow.
 
     Attributes:
-        beam: For the reconstruction; its metals are those of `alloys`, scaled.
-        kvp: Tube voltage of the packaged spectrum that it starts from; None where a spectrum was given.
-        hardness_mm: Aluminium that it is behind, in mm; negative where it is softer.
-        alloys: The metal of each of the components' materials.
-        scales: Attenuation of each over that of the packaged alloy.
-        scatter_scale: How much more scatter there is behind the metal than was told.
-        lengths_mm: Path lengths (M, N) of the pixels that were used.
-        measured: What the metal alone let through in them (N,): the measured over the modelled primary, times the
-            metal's own.
-        residual: Root mean square of what is left of the primary, in standard deviations.
-        cost: What was minimised, half a sum of squares: by so much other voltages and alloys were less likely.
+        beam: Beam model for the reconstruction, with the scaled attenuation of `alloys`.
+        kvp: Tube voltage of the packaged spectrum; None if a spectrum was given.
+        hardness_mm: Additional aluminium filter, mm; negative if the beam is softer than the spectrum.
+        alloys: Alloy fitted for each of the components' materials.
+        scales: Attenuation of each relative to the packaged alloy.
+        scatter_scale: Scatter behind the metal relative to the given scatter.
+        lengths_mm: Path lengths (M, N) in the pixels used.
+        measured: Transmission of the metal alone in these pixels (N,): measured over modelled primary, times the
+            modelled transmission of the metal.
+        residual: Root mean square residual of the primary, in standard deviations.
+        cost: Minimum of the cost function (half a sum of squares), by which voltages and alloys are compared.
     """
 
     beam: BeamModel
@@ -151,9 +151,9 @@ class BeamEstimate:
     cost: float
 
     def in_words(self) -> dict[str, Any]:
-        """What a record says of it: plain numbers and names."""
-        told = ("kvp", "hardness_mm", "alloys", "scales", "scatter_scale", "residual", "cost")
-        return {name: getattr(self, name) for name in told}
+        """Summary for a record: plain numbers and names."""
+        names = ("kvp", "hardness_mm", "alloys", "scales", "scatter_scale", "residual", "cost")
+        return {name: getattr(self, name) for name in names}
 
 
 def estimate_beam(
@@ -170,32 +170,32 @@ def estimate_beam(
     backend: str = "auto",
     progress: bool | None = False,
 ) -> BeamEstimate:
-    """The beam, and the metals' attenuation in it, that explain what known metal lets through.
+    """Estimate the beam and the metals' attenuation from the transmission of known metal.
 
-    How much of the beam passes so many millimetres of metal is a curve that rises and flattens. The registered
-    components say how many millimetres there are, a reconstruction around their shadow (`inpainted`) what else stands
-    in the way. Fitted are the tube's voltage, the filter in mm of aluminium, and a factor of each metal's attenuation
-    (another alloy, another density): with these the curve is that of some spectrum and some metal, whatever the data.
+    The line integral as a function of the metal's path length is a curve that rises and flattens. The path lengths come
+    from the registered components, the background from a reconstruction that leaves out their shadow (`inpainted`).
+    The fit determines the tube voltage, the filter in mm of aluminium and a factor of each metal's attenuation (another
+    alloy, another density). The fitted curve therefore always belongs to a physical spectrum and metal.
 
     Args:
         transmission: Measured intensity over the open beam's, (V, rows, cols).
         geometry: The views.
-        grid: Voxels that hold all that stands in the beam.
-        components: Metal in its registered place.
-        spectrum: As detected, where it is known, and only the metal is not.
+        grid: Voxels that contain everything in the beam.
+        components: Registered metal components.
+        spectrum: Detected spectrum, if it is known and only the metal is not.
         scatter: See `prepare`.
         mask: 0 where a pixel holds no measurement.
-        alloys: Names of materials that any of the components may be of; without, each is of its own.
-        soft_tissue: Attenuation over water of what most of the object is, where that is known: 1 in a water bath. It
-            fixes the scale of all attenuation, which the metal's shadow leaves free within a per cent or two.
-        backend: Of the projectors.
-        progress: Show a bar over the spectra and alloys that are tried; None: on a terminal only.
+        alloys: Names of further materials to try for each component; without them, only its given material is used.
+        soft_tissue: Attenuation of the object's predominant tissue relative to water, if known: 1 in a water bath. It
+            fixes the scale of all attenuation, which the metal's shadow alone determines only to 1-2 %.
+        backend: Projector backend.
+        progress: Show a progress bar over the spectra and alloys; None: on a terminal only.
 
     Raises:
-        ValueError: If there are no components, or too few pixels behind metal to tell.
+        ValueError: If there are no components, or too few pixels behind metal.
     """
     if not components:
-        raise ValueError("a beam is estimated behind known metal, and there are no components")
+        raise ValueError("the beam is estimated from known metal, but there are no components")
     if mask is not None:
         transmission = filled_transmission(transmission, mask)
     veil = scatter_image(transmission, scatter, geometry.pixel_spacing)
@@ -206,30 +206,32 @@ def estimate_beam(
     spectra = {None: spectrum} if spectrum is not None else {kvp: tungsten_spectrum(kvp) for kvp in TUBE_KVP}
     metals = list(itertools.product(*(dict.fromkeys([name, *alloys]) for name in known_materials(components))))
     tried = progress_bar(list(itertools.product(spectra.items(), metals)), desc="beam", shown=progress)
-    fits = [_fitted(shadow, one, kvp, names, soft_tissue) for (kvp, one), names in tried]
+    fits = [_fitted(shadow, candidate, kvp, names, soft_tissue) for (kvp, candidate), names in tried]
     best = min(fits, key=lambda fit: fit.cost)
     for doubt in _doubts(best, shadow):
         warnings.warn(f"the estimated beam is doubtful: {doubt}", stacklevel=2)
     return best
 
 
-def _doubts(found: BeamEstimate, shadow: MetalShadow) -> list[str]:
-    """Why an estimate may be far off."""
+def _doubts(estimate: BeamEstimate, shadow: MetalShadow) -> list[str]:
+    """Reasons why an estimate may be wrong."""
     doubts = []
     if math.isnan(shadow.tissue):
-        doubts.append("there is no soft tissue around the metal to fix its scale: attenuation may be off as a whole")
-    for alloy, scale in zip(found.alloys, found.scales):
+        doubts.append("there is no soft tissue around the metal to fix the scale: all attenuation may be off")
+    for alloy, scale in zip(estimate.alloys, estimate.scales):
         if abs(scale - 1) > UNLIKELY * SCALE:
-            doubts.append(f"{alloy} comes out with {scale:.2f} of its attenuation: is it another metal, or misplaced?")
-    if abs(found.hardness_mm) > UNLIKELY * HARDNESS_MM:
-        doubts.append(f"a filter of {found.hardness_mm:.0f} mm of aluminium beside the usual one: give a spectrum")
+            doubts.append(f"{alloy} is fitted with {scale:.2f} times its attenuation: wrong metal or wrong position?")
+    if abs(estimate.hardness_mm) > UNLIKELY * HARDNESS_MM:
+        doubts.append(
+            f"the filter differs by {estimate.hardness_mm:.0f} mm of aluminium from the usual: give a spectrum"
+        )
     return doubts
 
 
 def _fitted(
     shadow: MetalShadow, spectrum: Spectrum, kvp: float | None, metals: Sequence[str], soft_tissue: float | None
 ) -> BeamEstimate:
-    """The hardness and scales that explain the shadow best."""
+    """Estimate with the filter and scales that best fit the shadow."""
     water, reference_kev = material("water"), float(shadow.start.reference_kev or 0)
     whole = Beam.of([*(material(name) for name in metals), water], spectrum, num_bins=NUM_BINS)
     energies, logs = whole.energies_kev.numpy(), whole.weights.log().numpy()
@@ -247,41 +249,41 @@ def _fitted(
         metal = np.einsum("m,me,mn->en", x[2:], attenuation, lengths)
         return shares(x[0]) @ np.exp(-metal - ratio[:, None] * behind)
 
-    def left(x: np.ndarray) -> np.ndarray:
+    def residual(x: np.ndarray) -> np.ndarray:
         return (passed(x, background) + x[1] * scatter - primary) / deviation
 
     knows_tissue, start = not math.isnan(shadow.tissue), shadow.start
-    own = _corrected(start.weights.numpy(), start.background.numpy(), shadow.typical) if knows_tissue else 1.0
+    start_line = _corrected(start.weights.numpy(), start.background.numpy(), shadow.typical) if knows_tissue else 1.0
 
     likely, spread = (1.0, TISSUE) if soft_tissue is None else (soft_tissue, KNOWN_TISSUE)
 
     def tissue(x: np.ndarray) -> float:
-        """Its attenuation over water, whose logarithm changes with the beam as a typical line integral's does."""
-        return shadow.tissue * _corrected(shares(x[0]), ratio, shadow.typical) / own if knows_tissue else likely
+        """Tissue attenuation relative to water; scales with the beam like a typical corrected line integral."""
+        return shadow.tissue * _corrected(shares(x[0]), ratio, shadow.typical) / start_line if knows_tissue else likely
 
     def misfit(x: np.ndarray) -> np.ndarray:
-        data = left(x) * math.sqrt(min(1.0, INDEPENDENT / len(primary)))
+        data = residual(x) * math.sqrt(min(1.0, INDEPENDENT / len(primary)))
         prior = [x[0] / HARDNESS_MM, x[1] / SCATTER, math.log(tissue(x) / likely) / spread]
         return np.concatenate([data, prior, (x[2:] - 1) / SCALE])
 
     fit = least_squares(misfit, np.concatenate([[0.0, 0.0], np.ones(len(metals))]))
-    found = fit.x
-    beam = whole.behind(float(found[0]), range(len(metals)))
-    scaled = Beam(beam.energies_kev, beam.weights, beam.attenuation * torch.tensor(found[2:])[:, None])
+    best = fit.x
+    beam = whole.behind(float(best[0]), range(len(metals)))
+    scaled = Beam(beam.energies_kev, beam.weights, beam.attenuation * torch.tensor(best[2:])[:, None])
     return BeamEstimate(
         BeamModel.behind(scaled, reference_kev=reference_kev),
         kvp,
-        float(found[0]),
+        float(best[0]),
         tuple(metals),
-        tuple(float(s) for s in found[2:]),
-        1 + float(found[1]),
+        tuple(float(s) for s in best[2:]),
+        1 + float(best[1]),
         shadow.lengths,
-        torch.from_numpy((primary - found[1] * scatter) / passed(found, background) * passed(found, 0 * background)),
-        float(np.sqrt(np.mean(left(found) ** 2))),
+        torch.from_numpy((primary - best[1] * scatter) / passed(best, background) * passed(best, 0 * background)),
+        float(np.sqrt(np.mean(residual(best) ** 2))),
         float(fit.cost),
     )
 
 
 def _corrected(shares: np.ndarray, ratio: np.ndarray, line: float) -> float:
-    """The background's line integral at the reference energy that comes out of a beam as `line`."""
+    """Line integral of the background at the reference energy that is measured as `line` with the beam."""
     return float(brentq(lambda b: -math.log(shares @ np.exp(-ratio * b)) - line, 0, 10 * line + 1))

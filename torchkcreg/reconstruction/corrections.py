@@ -1,4 +1,4 @@
-"""Corrections of measured transmissions before the logarithm: scatter and glare, and the floor of the logarithm."""
+"""Corrections of measured transmissions before the logarithm: scatter, glare and a floor for the logarithm."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from torchkcreg.physics.scatter import fixed_point_veil
 
 AIR_TOLERANCE = 0.03
 FEWEST_AIR = 50
-SHADOW = 0.3  # transmission of metal below which a pixel tells of scatter
+SHADOW = 0.3  # below this transmission of the metal a pixel is used to estimate scatter
 FIT_VIEWS = 20
 FIT_COLUMNS = 24
-SIGMAS_MM = (10.0, 20.0, 30.0, 45.0, 65.0, 100.0)  # where the fit looks first
+SIGMAS_MM = (10.0, 20.0, 30.0, 45.0, 65.0, 100.0)  # starting values of the fit
 
 
 def scatter_image(transmission: Tensor, scatter: Veil | Tensor | None, pixel_spacing: Sequence[float]) -> Tensor:
-    """Scatter in units of the open beam, of the transmission's shape, however it is told; zeros where there is none."""
+    """Scatter image in units of the open beam, from a veil or an image, in the transmission's shape; zeros if None."""
     if isinstance(scatter, Veil):
         return veil_image(transmission, scatter, pixel_spacing)
     return torch.zeros_like(transmission) if scatter is None else scatter
 
 
 def fit_veil(transmission: Tensor, pixel_spacing: Sequence[float], *, mask: Tensor | None = None) -> Veil:
-    """The veil that makes the air around the object come out as the open beam.
+    """Fit the veil so that the air around the object has a primary transmission of 1.
 
-    Where nothing stands in the beam the primary is 1, and what is measured beyond that is the veil: it falls towards
-    the object's shadow, and how it does tells share and breadth. Least squares over the pixels of air, which are chosen
-    anew with each estimate.
+    In air the primary is 1 and the rest of the signal is the veil. It falls off towards the object's shadow; this
+    fall-off determines the veil's fraction and width. The fit minimises the capped mean absolute error over the air
+    pixels, which are selected again after each estimate.
 
     Args:
-        transmission: measured intensity in units of the open beam without a veil, (V, rows, cols).
+        transmission: Measured intensity in units of the open beam without veil, (V, rows, cols).
         pixel_spacing: (dv, du), mm.
-        mask: 0 where a pixel holds no measurement, saturated ones for instance.
+        mask: 0 where a pixel holds no measurement, for example because it is saturated.
 
     Raises:
-        ValueError: too few pixels show air to tell.
+        ValueError: If too few pixels show air.
     """
     views = np.unique(np.linspace(0, len(transmission) - 1, FIT_VIEWS).round().astype(int)).tolist()
     images = transmission[views][:, None].float()
@@ -55,7 +55,7 @@ def fit_veil(transmission: Tensor, pixel_spacing: Sequence[float], *, mask: Tens
     for attempt in range(4):
         if int(air.sum()) < FEWEST_AIR:
             raise ValueError(f"only {int(air.sum())} pixels show air, too few to fit the scatter: give its fraction")
-        if attempt == 0:  # the object's rims, not yet told from air, make local minima: look everywhere first
+        if attempt == 0:  # object edges still counted as air cause local minima, so start from a grid search
             candidates = [_best_fraction(sigma, measured, air, pitch) for sigma in SIGMAS_MM]
             start = min(candidates, key=lambda x: _air_misfit(x, measured, air, pitch))
         start = minimize(_air_misfit, start, args=(measured, air, pitch), method="Nelder-Mead", tol=1e-4).x
@@ -66,7 +66,7 @@ def fit_veil(transmission: Tensor, pixel_spacing: Sequence[float], *, mask: Tens
 
 
 def _best_fraction(sigma_mm: float, measured: Tensor, air: Tensor, pitch: float) -> np.ndarray:
-    log_sigma = math.log(sigma_mm)  # no cap on a pixel's misfit here: it would leave plateaus
+    log_sigma = math.log(sigma_mm)  # no cap on a pixel's misfit here: it would create plateaus
     fit = minimize_scalar(
         lambda f: _air_misfit(np.array([f, log_sigma]), measured, air, pitch, math.inf),
         bounds=(0, 0.95),
@@ -93,20 +93,20 @@ def refined_scatter(
     *,
     sigma_mm: float = 10.0,
 ) -> Tensor:
-    """The scatter corrected in the shadow of known metal, where nearly all that arrives is scatter.
+    """Scatter corrected in the shadow of known metal, where nearly all of the signal is scatter.
 
-    What is measured beyond the primary that implant and background let through is averaged over Gaussian windows, each
-    pixel weighing the less the more primary it has, and added; away from metal nothing changes.
+    The excess of the measured signal over the predicted primary and scatter is averaged over Gaussian windows and added
+    to the scatter. Pixels with more primary have lower weight. Away from metal nothing changes.
 
     Args:
-        transmission: measured, in units of the open beam, (V, rows, cols).
-        scatter: estimate so far, same shape.
-        predicted: primary that a first reconstruction and the known components predict, same shape.
-        metal: transmission of the known components alone, same shape.
+        transmission: Measured transmission in units of the open beam, (V, rows, cols).
+        scatter: Current estimate, same shape.
+        predicted: Primary predicted by a first reconstruction and the known components, same shape.
+        metal: Transmission of the known components alone, same shape.
         pixel_spacing: (dv, du), mm.
-        sigma_mm: of the windows, on the detector.
+        sigma_mm: Standard deviation of the windows on the detector, mm.
     """
-    noise, share = 2e-3, 0.05  # transmission: what noise leaves of a pixel, and how well the primary is known
+    noise, share = 2e-3, 0.05  # transmission noise, and relative error of the predicted primary
     weights = (metal < SHADOW) * noise**2 / (noise**2 + (share * predicted) ** 2)
     sigma = sigma_mm / math.sqrt(pixel_spacing[0] * pixel_spacing[1])
     excess = gaussian_blur(weights * (transmission - scatter - predicted), sigma)
@@ -114,14 +114,15 @@ def refined_scatter(
 
 
 def floored_line_integrals(primary: Tensor, *, floor: float = 1e-3) -> Tensor:
-    """Line integrals ``-ln max(primary, floor)`` of transmissions; finite whatever the noise did.
+    """Line integrals `-ln max(primary, floor)` of transmissions; finite even for noisy pixels.
 
     Args:
-        primary: transmission without scatter, in units of the open beam.
-        floor: smallest transmission taken at its word. A pixel there weighs next to nothing, see `statistical_weights`.
+        primary: Transmission without scatter, in units of the open beam.
+        floor: Smallest transmission used; lower values are raised to it. Such pixels have almost no weight, see
+            `statistical_weights`.
 
     Raises:
-        ValueError: a floor that is not positive.
+        ValueError: If the floor is not positive.
     """
     if not floor > 0:
         raise ValueError(f"floor must be positive, got {floor}")

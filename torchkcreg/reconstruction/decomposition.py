@@ -1,4 +1,4 @@
-"""Water and calcium out of scans at several tube voltages, around known metal (KC-MBMD)."""
+"""Decomposition into water and calcium from scans at several tube voltages, with known metal (KC-MBMD)."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from .pwls import PWLSConfig, ordered_subsets, pwls
 from .spectral import BeamModel, mineral_part
 from .system import BLOCK_VIEWS, System, VoxelRoughness, VoxelSystem, projected
 
-CALCIUM_UNIT = 100.0  # mg/mL, in which calcium is solved for: its line integrals then are of the water's size
-LEAST_TRANSMISSION = 2e-3  # below it a pixel tells more of scatter than of the object
+CALCIUM_UNIT = 100.0  # mg/mL, unit of calcium in the solver: its line integrals are then of similar size to water's
+LEAST_TRANSMISSION = 2e-3  # below it scatter dominates a pixel
 NUM_BINS = 8
 
 
 @dataclass(frozen=True)
 class SpectralViews:
-    """Views of one spectrum: what metal lets through of each energy, and the two materials' attenuation there."""
+    """Views of one spectrum, with the metal's transmission and the two materials' attenuation at each energy."""
 
     views: list[int]
     beam: BeamModel
     shares: Tensor  # (K, v, rows, cols) or (K, 1, 1, 1)
-    basis: Tensor  # (2, K), 1/mm, of water and of CALCIUM_UNIT
+    basis: Tensor  # (2, K), attenuation of water and of CALCIUM_UNIT, 1/mm
 
 
 class TwoMaterials:
@@ -41,13 +41,13 @@ class TwoMaterials:
 
     Args:
         system: Projector.
-        lines: Line integrals as measured, without scatter, (V, rows, cols).
-        weights: How much each counts.
-        sources: All views, by spectrum.
+        lines: Measured line integrals without scatter, (V, rows, cols).
+        weights: Statistical weights of the line integrals.
+        sources: All views, grouped by spectrum.
         unknown: Share of each voxel that no metal fills, (D, H, W); 1 if None.
         config: Iterations, subsets, momentum and roughness.
-        spacing: Of the voxels (x, y, z), mm.
-        start: Water and calcium, (2, D, H, W).
+        spacing: Voxel spacing (x, y, z), mm.
+        start: Initial water and calcium, (2, D, H, W).
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class TwoMaterials:
         return volume if self.unknown is None else volume * self.unknown
 
     def _modelled(self, paths: Tensor, views: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Line integrals (v, rows, cols) of two materials' (2, v, rows, cols), and their derivatives to these."""
+        """Line integrals (v, rows, cols) and their derivatives by the two materials' paths (2, v, rows, cols)."""
         lines, slopes = torch.empty_like(paths[0]), torch.empty_like(paths)
         for row, view in enumerate(views):
             source, n = self.place[view]
@@ -87,7 +87,7 @@ class TwoMaterials:
         return torch.stack([self.system.project(self._masked(part), views) for part in x])
 
     def _curvature(self) -> Tensor:
-        """Of the parabolas in each voxel: water's, between the two, calcium's, (3, D, H, W)."""
+        """Curvatures of the surrogate parabolas in each voxel, (3, D, H, W): water, mixed, calcium."""
         ones = self._masked(torch.ones_like(self.x[0]))
         total = self.x.new_zeros(3, *ones.shape)
         for start in range(0, self.system.num_views, BLOCK_VIEWS):
@@ -102,7 +102,7 @@ class TwoMaterials:
         return total
 
     def iterate(self) -> float:
-        """One pass through the subsets; the misfit's root mean square before."""
+        """Run one pass through the subsets; returns the root mean square misfit of the points it stepped from."""
         stage = self.config.stage(self.iteration)
         if self.iteration and stage.subsets != self.config.stage(self.iteration - 1).subsets:
             self.ahead, self.pace = self.x.clone(), 1.0
@@ -129,30 +129,30 @@ class TwoMaterials:
 
 
 def _least(point: Tensor, gradient: Tensor, curvature: Tensor) -> Tensor:
-    """Where parabolas in water and calcium (2, ...) are least with water not negative.
+    """Minimum (2, ...) of parabolas in water and calcium, with water not negative.
 
-    Where water is cut off, calcium is the least beside none: clamping the step would leave it where it went together
-    with the water. Calcium may be negative: noise cut off at zero would be calcium on average.
+    Where water is clamped to 0, calcium is minimised with water at 0; clamping the joint step alone would leave calcium
+    at a wrong value. Calcium may be negative, because clamping noise at zero would bias its mean.
     """
     (w, c), (along_w, along_c), (ww, wc, cc) = point, gradient, curvature
     determinant = (ww * cc - wc * wc).clamp_min(1e-12 * ww * cc)
     water = w - (cc * along_w - wc * along_c) / determinant
     calcium = c - (ww * along_c - wc * along_w) / determinant
-    beside_none = c - (along_c - wc * w) / cc
-    return torch.stack([water.clamp_min(0), torch.where(water < 0, beside_none, calcium)])
+    without_water = c - (along_c - wc * w) / cc
+    return torch.stack([water.clamp_min(0), torch.where(water < 0, without_water, calcium)])
 
 
 @dataclass(frozen=True)
 class Decomposition:
-    """What is where, in two materials.
+    """Maps of water and calcium.
 
     Attributes:
-        water: Density of water or soft tissue over water's, (D, H, W); smooth inside metal.
-        calcium_mg_ml: Calcium, (D, H, W).
-        single_mg_ml: What the same data give for calcium where every voxel is taken for water plus calcium of water's
-            own density: known components, one attenuation.
+        water: Density of water or soft tissue relative to water, (D, H, W); smooth inside metal.
+        calcium_mg_ml: Calcium density, (D, H, W), mg/mL.
+        single_mg_ml: Calcium from a single-attenuation reconstruction of the same data with known components, taking
+            every voxel as water of normal density plus calcium, mg/mL.
         mask: Share of each voxel that no component fills; None without components.
-        history: Root mean squares of the weighted misfit, one an iteration.
+        history: Root mean square of the weighted misfit, one per iteration.
     """
 
     water: Tensor
@@ -177,26 +177,27 @@ def decompose(
 ) -> Decomposition:
     """Water and calcium in each voxel, from views at two tube voltages or more, with the metal known.
 
-    The outlook of Cao et al. 2020 (and Tilley et al. 2018, model-based material decomposition): voxels w of water and c
-    of calcium attenuate view i's energy k by ``T_ik exp(-mu_k A w - kappa_k A c)``, where T is what spectrum and known
-    metal leave; the measured line integrals are fitted by weighted least squares with quadratic roughness. Views of
-    different voltages need not see the same rays. Steps are separable in voxels, with the two materials' 2 x 2
-    curvature in each, ordered subsets and Nesterov's momentum as in `pwls`. It starts from one attenuation a voxel.
+    Proposed as an outlook by Cao et al. 2020; see also Tilley et al. 2018 (model-based material decomposition). With
+    voxels w of water and c of calcium, the signal of view i at energy k is `T_ik exp(-mu_k A w - kappa_k A c)`, where T
+    is the spectrum behind the known metal. The measured line integrals are fitted by weighted least squares with
+    quadratic roughness. Views at different voltages need not share the same rays. Steps are separable in voxels, with a
+    2 x 2 curvature of the two materials in each voxel, ordered subsets and Nesterov's momentum as in `pwls`. The start
+    is a reconstruction of a single attenuation per voxel.
 
     Args:
         transmission: Measured intensity over the open beam's, (V, rows, cols).
         geometry: The views, whose `sources` name their spectra.
-        grid: Voxels that hold all that stands in the beam.
-        spectra: As detected, by the sources' names.
-        components: Metal in its registered place.
-        config: Iterations, subsets and roughness (of attenuation, of either material).
+        grid: Voxels that contain everything in the beam.
+        spectra: Detected spectra, keyed by source name.
+        components: Registered metal components.
+        config: Iterations, subsets and roughness weight, for the single attenuation and for both materials.
         scatter: See `prepare`.
         mask: 0 where a pixel holds no measurement.
-        backend: Of the projectors.
+        backend: Projector backend.
         progress: Show a tqdm bar; None: on a terminal only.
 
     Raises:
-        ValueError: If views have no sources, a source no spectrum, or all spectra are alike.
+        ValueError: If the views have no sources, a source has no spectrum, or all spectra are alike.
     """
     config = config or PWLSConfig(iterations=30, subsets=10, beta=1.0)
     _check(geometry, spectra)
@@ -228,7 +229,7 @@ def _check(geometry: ConeBeamGeometry, spectra: Mapping[str, Spectrum]) -> None:
         raise ValueError(f"spectra must have one for each source, got none for {', '.join(missing)}")
     used = [spectra[name] for name in sorted(set(geometry.sources))]
     if max(s.mean_energy for s in used) - min(s.mean_energy for s in used) < 1.0:
-        raise ValueError("two materials need two spectra: all views have the same one, to 1 keV of its mean")
+        raise ValueError("two materials need two spectra: all mean energies are within 1 keV")
 
 
 def _source(
@@ -261,17 +262,17 @@ def _one_attenuation(
     config: PWLSConfig,
     grid: VolumeGrid,
 ) -> Tensor:
-    """PWLS of all views, each corrected as its spectrum says, at one reference energy; mineral known from a first."""
+    """PWLS of all views, corrected to one reference energy; run twice, the second time with known mineral."""
     volume = torch.zeros(system.volume_shape).to(lines)
     for number in range(2):
         corrected, counted, mineral = torch.empty_like(lines), torch.empty_like(lines), None
         if number:
             mineral = projected(system, mineral_part(volume, sources[0].beam, mask=unknown))
         for source in sources:
-            own = source.views
-            part: Tensor | None = None if mineral is None else mineral[own]
-            b, slope = without_components(lines[own], [(slice(None), source.shares)], source.beam, mineral=part)
-            corrected[own], counted[own] = b, weights[own] * slope**2
+            views = source.views
+            part: Tensor | None = None if mineral is None else mineral[views]
+            b, slope = without_components(lines[views], [(slice(None), source.shares)], source.beam, mineral=part)
+            corrected[views], counted[views] = b, weights[views] * slope**2
         volume = pwls(
             system, corrected, counted, config, mask=unknown, initial=volume, roughness=VoxelRoughness(grid.spacing)
         ).volume
@@ -279,7 +280,7 @@ def _one_attenuation(
 
 
 def _split(volume: Tensor, beam: BeamModel, unknown: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Water, and calcium in its unit, of one attenuation a voxel: above water all is calcium."""
+    """Water, and calcium in CALCIUM_UNIT, from a single attenuation: the excess over water is taken as calcium."""
     excess = mineral_part(volume, beam, mask=None)
     return (volume - excess) / beam.water, excess / (
         CALCIUM_UNIT * float(calcium_attenuation((float(beam.reference_kev or 0),))[0])

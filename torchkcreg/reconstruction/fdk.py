@@ -20,9 +20,9 @@ from .redundancy import AngularSampling, angular_sampling, full_scan_weights, is
 from .scan_views import ViewShard
 
 WINDOWS = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")
-EDGE_PIXELS = 4  # averaged for the value that a truncated row goes on with, so that it is not one pixel's noise
+EDGE_PIXELS = 4  # averaged for the value that extends a truncated row, to reduce noise
 BLOCK_VIEWS = 16  # filtered together, to bound memory
-Views = Callable[[list[int]], Tensor]  # reads the images of some views
+Views = Callable[[list[int]], Tensor]  # returns the images of the given views
 
 
 def ramp_response(
@@ -30,18 +30,18 @@ def ramp_response(
 ) -> Tensor:
     """Frequency response (length // 2 + 1,) of the band-limited ramp |f|, in 1/mm, times a window.
 
-    The response is the transform of the sampled kernel ``h(0) = 1 / (4 d^2)``, ``h(n) = -1 / (pi n d)^2`` for odd n
-    and 0 for even n (Kak and Slaney 1988, eq. 3.61), times d: sampling |f| itself would lose the mean of the image.
+    The response is the transform of the sampled kernel `h(0) = 1 / (4 d^2)`, `h(n) = -1 / (pi n d)^2` for odd n
+    and 0 for even n (Kak and Slaney 1988, eq. 3.61), times d. Sampling |f| directly would lose the image's mean.
 
     Args:
-        length: samples of the padded row.
-        spacing: distance d between samples, mm.
+        length: Number of samples of the padded row.
+        spacing: Distance d between samples, mm.
         window: "ram-lak" (none), "shepp-logan", "cosine", "hamming" or "hann".
-        cutoff: frequency, as a share of the highest one, where the window ends; beyond it the response is 0.
-        dtype: of the result.
+        cutoff: Frequency where the window ends, as a fraction of the highest one; the response beyond it is 0.
+        dtype: Type of the result.
 
     Raises:
-        ValueError: an unknown window, or a cutoff outside (0, 1].
+        ValueError: If the window is unknown or the cutoff is outside (0, 1].
 
     >>> response = ramp_response(64, 0.5)
     >>> round(float(response[32]), 2), bool(response[0] > 0)
@@ -62,7 +62,7 @@ def ramp_response(
 
 
 def _window(name: str, share: Tensor) -> Tensor:
-    """Values of a window at frequencies given as shares of its end."""
+    """Values of a window at frequencies given as fractions of its end."""
     if name == "shepp-logan":
         return torch.sinc(share / 2)
     if name == "cosine":
@@ -82,23 +82,23 @@ def filter_rows(
     cutoff: float = 1.0,
     extrapolate: tuple[bool, bool] = (True, True),
 ) -> Tensor:
-    """Images (..., cols) convolved with the ramp along their rows; in the images' unit over mm.
+    """Ramp-filtered images (..., cols), convolved along their rows; unit of the images per mm.
 
     Args:
-        images: cosine-weighted projections.
-        spacing: distance between columns, mm, where the reconstruction formula wants it: on the axis of rotation.
-        window: see `ramp_response`.
-        cutoff: see `ramp_response`.
-        extrapolate: before the first and after the last column, go on beyond the detector with the border's value,
-            falling to 0 along a cosine over half the detector's width, so that an object larger than the detector does
-            not end in a bright rim. Where the border is air nothing changes.
+        images: Cosine-weighted projections.
+        spacing: Distance between columns at the axis of rotation, mm.
+        window: See `ramp_response`.
+        cutoff: See `ramp_response`.
+        extrapolate: If true, extend the rows (before the first column, after the last column) by the border's value,
+            falling to 0 along a cosine over half the detector's width. This avoids a bright rim if the object is larger
+            than the detector. Where the border is air nothing changes.
 
     >>> rows = filter_rows(torch.ones(2, 256), 0.5)
     >>> bool(rows[0, 128].abs() < 0.02)
     True
     """
     cols = images.shape[-1]
-    before, after = (cols // 2 if wanted else 0 for wanted in extrapolate)
+    before, after = (cols // 2 if extended else 0 for extended in extrapolate)
     padded = torch.cat([_tail(images, before).flip(-1), images, _tail(images.flip(-1), after)], -1)
     length = 1 << max(1, math.ceil(math.log2(2 * padded.shape[-1])))
     response = ramp_response(length, spacing, window=window, cutoff=cutoff, dtype=images.dtype).to(images.device)
@@ -107,7 +107,7 @@ def filter_rows(
 
 
 def _tail(images: Tensor, extra: int) -> Tensor:
-    """What comes before the first column, nearest first: its value going to 0 along a cosine, (..., extra)."""
+    """Extension (..., extra) before the first column, nearest first: its value falling to 0 along a cosine."""
     steps = torch.arange(1, extra + 1, dtype=images.dtype, device=images.device) / (extra + 1)
     edge = images[..., : min(EDGE_PIXELS, images.shape[-1])].mean(-1, keepdim=True)
     return edge * (0.5 + 0.5 * torch.cos(math.pi * steps))
@@ -117,11 +117,11 @@ class FDKConfig(Config):
     """Options of `fdk`.
 
     Attributes:
-        window: of the ramp: "ram-lak", "shepp-logan", "cosine", "hamming" or "hann".
-        cutoff: where the window ends, as a share of the highest frequency.
-        extrapolate: whether rows that the detector cuts off go on smoothly.
-        combine: whether each focal spot's views make a volume of their own, mixed by height; otherwise all views are
-            taken for one scan.
+        window: Window of the ramp: "ram-lak", "shepp-logan", "cosine", "hamming" or "hann".
+        cutoff: End of the window, as a fraction of the highest frequency.
+        extrapolate: Extend rows truncated by the detector smoothly.
+        combine: Reconstruct one volume per focal spot and blend them by height; otherwise all views are treated as one
+            scan.
     """
 
     window: str = "ram-lak"
@@ -139,29 +139,29 @@ def fdk(
     shard: ViewShard | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Attenuation (..., D, H, W) in 1/mm from line integrals (..., V, rows, cols): filtered back-projection.
+    """Filtered back-projection: attenuation (..., D, H, W) in 1/mm from line integrals (..., V, rows, cols).
 
-    ``f(x) = sum_v db_v (R / depth_v(x))^2 q_v(u, v)`` with q the projection times ``R / sqrt(R^2 + p^2 + zeta^2)`` and
-    the weight of redundant rays, ramp-filtered along p; p, zeta are mm on the virtual detector on the axis of rotation
-    and R the source's distance from it. Views may come in any order, at any angles around the world's z axis, over a
-    full turn or a short scan (180 degrees and the fan angle; Parker weights). Offset detectors (full scans) have their
-    overlap weighted; tilted ones are resampled first.
+    `f(x) = sum_v db_v (R / depth_v(x))^2 q_v(u, v)`. Here q is the projection times `R / sqrt(R^2 + p^2 + zeta^2)`
+    and the redundancy weight, ramp-filtered along p. The positions p and zeta are in mm on the virtual detector through
+    the axis of rotation, and R is the source-to-axis distance. Views may be in any order and at any angles around the
+    world's z axis, over a full turn or a short scan (180 degrees plus the fan angle; Parker weights). The overlap of
+    offset detectors is weighted (full scans only). Tilted detectors are resampled first.
 
-    Several focal spots (`geometry.sources`) make a volume each, exact in the plane of the spot; at a height between two
-    spots they are mixed linearly, as far as each sees the voxel. So the cone angle stays small over the whole height.
+    With several focal spots (`geometry.sources`) a volume is reconstructed for each; it is exact in the plane of the
+    spot. Between the heights of two focal spots their volumes are blended smoothly, each weighted by how completely it
+    sees the voxel (`height_shares`). This keeps the cone angle small over the whole height.
 
     Args:
-        projections: line integrals (..., V, rows, cols); masked pixels must hold a sensible value. Or a function that
-            gives those of a list of views, (v, rows, cols): of a scan that is larger than memory, each view is asked
-            for once.
-        geometry: the views; a gantry that does not turn about the world's z axis is brought there by `moved`.
-        grid: the voxels.
-        config: window, extrapolation, how focal spots combine.
-        shard: the share of the views that this process works on, see `ViewShard`; the result is the whole on each.
-        backend: of the back-projection.
+        projections: Line integrals (..., V, rows, cols); masked pixels must be filled. For scans larger than memory, a
+            function that returns the line integrals (v, rows, cols) of a list of views; each view is requested once.
+        geometry: The views. If the gantry does not rotate about the world's z axis, align it first with `moved`.
+        grid: The voxels.
+        config: Window, extrapolation and combination of focal spots.
+        shard: Views that this process works on, see `ViewShard`; every process gets the complete result.
+        backend: Back-projection backend.
 
     Raises:
-        ValueError: shapes that don't fit, too few angles, values that are not finite, or a grid that no view sees.
+        ValueError: If shapes do not match, there are too few angles, values are not finite, or no view sees the grid.
 
     >>> import torch
     >>> from torchkcreg.geometry import VolumeGrid, circular_geometry
@@ -186,8 +186,8 @@ def fdk(
 
     def of_spot(number: int) -> Tensor:
         views, part = groups[number], parts[number]
-        own = shard.within(views) if shard is not None else None
-        volume = _single_spot(lambda block: read([views[i] for i in block]), part, grid, config, own, backend)
+        local_shard = shard.within(views) if shard is not None else None
+        volume = _single_spot(lambda block: read([views[i] for i in block]), part, grid, config, local_shard, backend)
         return volume.mul_(shares[number].to(volume))
 
     total = of_spot(0)
@@ -198,10 +198,11 @@ def fdk(
 
 @dataclass(frozen=True)
 class _Plan:
-    """Weights and filter of the views of one focal spot.
+    """Weights and filter options of the views of one focal spot.
 
-    `weights` (V, cols) hold redundancy, angular step and R^2; `padding` counts columns of zeros put before and after
-    the detector's, and `matrices` are those of the padded detector; `sides` says where truncated rows go on.
+    `weights` (V, cols) are the product of redundancy weight, angular step and R^2. `padding` is the number of zero
+    columns added before and after the detector's columns, `matrices` are the projection matrices of the padded
+    detector, and `sides` are the sides where truncated rows are extended.
     """
 
     radii: Tensor
@@ -250,7 +251,7 @@ def _plan(geometry: ConeBeamGeometry, sampling: AngularSampling, config: FDKConf
     if sampling.full:
         redundancy = full_scan_weights(columns, radii)
         if is_offset(columns):
-            # what the ramp spreads beyond the near end counts too, and nothing is cut off there: its weight is 0
+            # pad the short side: the filtered signal beyond it contributes; no extrapolation there, its weight is 0
             first, last = -float(columns[0, 0]), float(columns[0, -1])
             missing = round(abs(abs(first) - abs(last)) / abs(float(columns[0, 1] - columns[0, 0])))
             near_is_first = abs(first) < abs(last)
@@ -277,7 +278,11 @@ def _filtered(images: Tensor, plan: _Plan, views: list[int], config: FDKConfig) 
 
 
 def check_projections(projections: Tensor, geometry: ConeBeamGeometry, num_views: int | None = None) -> None:
-    """Nothing; ValueError unless projections are finite numbers of the geometry's views, or so many, and detector."""
+    """Check that projections are finite and match the detector and `num_views` (default: the geometry's).
+
+    Raises:
+        ValueError: If they do not.
+    """
     expected = (geometry.num_views if num_views is None else num_views, *geometry.det_shape)
     if projections.dim() < 3 or tuple(projections.shape[-3:]) != expected:
         raise ValueError(

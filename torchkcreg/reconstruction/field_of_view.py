@@ -1,4 +1,4 @@
-"""Which voxels the views see, and the grid that holds them."""
+"""Field of view: coverage of voxels by the views, and a grid that contains it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torch.nn.functional import interpolate
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 
 COARSE_MM = 8.0  # coverage is smooth: it is computed on nodes about this far apart
-RIM_PX = 8.0  # over which a voxel's coverage falls to nothing at the detector's border
-SPREAD_MM = 10.0  # views without labels whose sources' heights differ by less belong together
+RIM_PX = 8.0  # width of the border over which coverage falls to zero
+SPREAD_MM = 10.0  # focal spots whose mean heights differ by less are treated as one
 
 
 def coverage(geometry: ConeBeamGeometry, grid: VolumeGrid) -> Tensor:
-    """Share of the views (D, H, W), float32, that see each voxel; a view near its border counts in part."""
+    """Fraction of the views that see each voxel, (D, H, W), float32; a view near its border counts in part."""
     steps = [max(1, round(COARSE_MM / d)) for d in reversed(grid.spacing)]
     shape = tuple(max(2 if n > 1 else 1, -(-n // step) + 1) for n, step in zip(grid.shape, steps))
     positions = [torch.linspace(0, n - 1, count, dtype=torch.float64) for n, count in zip(grid.shape, shape)]
@@ -33,17 +33,17 @@ def coverage(geometry: ConeBeamGeometry, grid: VolumeGrid) -> Tensor:
 
 
 def field_of_view_grid(geometry: ConeBeamGeometry, spacing: float) -> VolumeGrid:
-    """A grid of cubes about the z axis that holds all that any view sees near the axis.
+    """Grid of cubic voxels around the z axis that covers the field of view.
 
-    As wide as the circle around the axis that the widest side of the fan touches, and from the lowest to the highest
-    height that a ray has there.
+    Its width is the diameter of the circle around the axis that touches the outermost rays of the fan. Its height
+    reaches from the lowest to the highest ray of the central column where these pass the axis.
 
     Args:
-        geometry: the views.
-        spacing: edge of a voxel, mm.
+        geometry: The views.
+        spacing: Voxel edge, mm.
 
     Raises:
-        ValueError: spacing is not positive.
+        ValueError: If the spacing is not positive.
     """
     if not (math.isfinite(spacing) and spacing > 0):
         raise ValueError(f"spacing must be a positive length in mm, got {spacing}")
@@ -65,7 +65,7 @@ def field_of_view_grid(geometry: ConeBeamGeometry, spacing: float) -> VolumeGrid
 def views_by_source(geometry: ConeBeamGeometry) -> list[list[int]]:
     """Indices of the views of each focal spot, from the lowest spot to the highest.
 
-    Spots are told apart by their labels, and only where these stand at different heights.
+    Focal spots are distinguished by their labels. If they are all at about the same height, they form one group.
     """
     if geometry.sources is None:
         return [list(range(geometry.num_views))]
@@ -80,11 +80,12 @@ def views_by_source(geometry: ConeBeamGeometry) -> list[list[int]]:
 
 
 def height_shares(parts: list[ConeBeamGeometry], grid: VolumeGrid) -> Tensor:
-    """Shares (S, D, H, W) of the focal spots' volumes in the mixture; they add up to one.
+    """Blending weights (S, D, H, W) of the focal spots' volumes; they add up to one.
 
-    FDK is exact in the plane of the spot, and its error grows faster than the distance from it. So a height has the
-    nearest spot's volume, and over the middle half of the way from one spot to the next the one passes smoothly into
-    the other. Where a spot's views see a voxel in part its share falls with the fourth power of the part.
+    FDK is exact in the plane of the focal spot, and its error grows faster than linearly with the distance from it.
+    Each height therefore uses the nearest spot's volume; over the middle half of the distance between two spots their
+    volumes are blended smoothly. The weight also falls with the fourth power of the fraction of the spot's views that
+    see the voxel.
     """
     heights = [float(part.source_positions[:, 2].mean()) for part in parts]
     z = grid.points()[..., 2]
@@ -101,6 +102,6 @@ def height_shares(parts: list[ConeBeamGeometry], grid: VolumeGrid) -> Tensor:
 
 
 def _passage(way: Tensor) -> Tensor:
-    """0 for the first quarter of the way, 1 for the last, smooth between; ``f(1 - x) = 1 - f(x)``."""
+    """Smooth step from 0 in the first quarter to 1 in the last quarter; `f(1 - x) = 1 - f(x)`."""
     inner = (2 * way - 0.5).clamp(0, 1)
     return inner * inner * (3 - 2 * inner)

@@ -1,4 +1,4 @@
-"""Metal artefact reduction with known components (KC-MAR): what stands behind the registered metal is interpolated."""
+"""Metal artefact reduction with known components (KC-MAR): data in the shadow of registered metal are interpolated."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-_LEAST_MM = 0.05  # of metal in a pixel, below which it shows its background well
+_LEAST_MM = 0.05  # of metal in a pixel, below which the pixel counts as free of metal
 
 
 def filled(images: Tensor, mask: Tensor) -> Tensor:
-    """Images (..., rows, cols) whose masked pixels hold a mean of the nearest valid ones left, right, above and below.
+    """Images (..., rows, cols) with masked pixels filled from the nearest valid ones left, right, above and below.
 
-    Neighbours weigh with one over their distance. So a dead column is interpolated linearly along the rows, a dead row
-    along the columns; at the border the nearest value goes on. Valid pixels stay as they are.
+    The neighbours are averaged with weights of one over their distance. A dead column is thus interpolated linearly
+    along the rows, a dead row along the columns. At the border the nearest value is repeated. Valid pixels do not
+    change.
 
     Args:
-        images: Line integrals; what masked pixels hold, NaN included, does not matter.
+        images: Line integrals; values of masked pixels are ignored and may be NaN.
         mask: Nonzero where a pixel holds a measurement, same shape.
 
     Raises:
-        ValueError: Shapes differ, or a masked pixel has no valid one in its row and column.
+        ValueError: If shapes differ, or a masked pixel has no valid one in its row and column.
 
     >>> row = torch.tensor([[1.0, 9.0, 9.0, 4.0, 9.0]])
     >>> filled(row, torch.tensor([[1, 0, 0, 1, 0]])).tolist()
@@ -46,7 +47,7 @@ def filled(images: Tensor, mask: Tensor) -> Tensor:
 
 
 def filled_transmission(transmission: Tensor, mask: Tensor) -> Tensor:
-    """Transmissions whose masked pixels are filled as line integrals, see `filled`."""
+    """Transmissions with masked pixels filled by interpolation of line integrals, see `filled`."""
     tiny = torch.finfo(transmission.dtype).tiny
     lines = -torch.log(torch.where(mask != 0, transmission, 1.0).clamp_min(tiny))
     return torch.where(mask != 0, transmission, torch.exp(-filled(lines, mask)))
@@ -66,17 +67,17 @@ def _nearest(images: Tensor, valid: Tensor, dim: int, *, backwards: bool) -> tup
 
 
 def inpainted(line_integrals: Tensor, metal: Tensor, *, mask: Tensor | None = None, margin_px: int = 1) -> Tensor:
-    """Line integrals (V, rows, cols) as if the metal were not there, interpolated across its shadow.
+    """Line integrals (V, rows, cols) interpolated across the metal's shadow.
 
-    The shadow is that of the registered components (after Uneri et al. 2019), not of a threshold in a volume that
-    metal has spoilt, so that it is as narrow as it can be. Nothing is known of what stood behind the metal: this takes
-    seconds, where KC-Rec takes minutes and keeps what the metal lets through.
+    The shadow is projected from the registered components (after Uneri et al. 2019) instead of segmented in a volume
+    with metal artefacts, so it is as narrow as possible. The data behind the metal are discarded. This takes seconds;
+    KC-Rec takes minutes, but uses the data behind the metal.
 
     Args:
         line_integrals: Without scatter, (V, rows, cols).
-        metal: Path lengths in mm of the components (M, V, rows, cols), one image a material and view.
+        metal: Path lengths of the components (M, V, rows, cols), one image per material and view, mm.
         mask: 0 where a pixel holds no measurement.
-        margin_px: By how much the shadow is widened on all sides: the system's blur.
+        margin_px: Margin added to the shadow on all sides, to cover the system's blur.
 
     Raises:
         ValueError: If shapes differ, or a view shows nothing but metal.

@@ -1,4 +1,4 @@
-"""Known components in a reconstruction: the registered implant as mask and as path lengths (KC-Rec)."""
+"""Known components in a reconstruction (KC-Rec): the registered implant as mask and as path lengths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchkcreg.projector import project_points
 from .spectral import BeamModel, background_line_integrals, behind_metal
 
 BLOCK_VIEWS = 8
-COVERED = 0.999  # a voxel as full as this of metal shows nothing of the background
+COVERED = 0.999  # a voxel filled with metal to more than this share counts as metal only
 
 
 def known_materials(components: Sequence[KnownComponent]) -> list[str]:
@@ -23,7 +23,7 @@ def known_materials(components: Sequence[KnownComponent]) -> list[str]:
 
 
 def unknown_share(components: Sequence[KnownComponent], grid: VolumeGrid | TwoLevelGrid) -> Tensor:
-    """The mask s, (D, H, W) or (N,) on two levels: the share of each voxel that no component fills.
+    """Mask s, (D, H, W) or (N,) on two levels: the fraction of each voxel that is not filled by a component.
 
     >>> import trimesh
     >>> ball = KnownComponent.from_mesh(trimesh.creation.icosphere(2, 3.0), "steel", pitch=0.5)
@@ -40,7 +40,7 @@ def unknown_share(components: Sequence[KnownComponent], grid: VolumeGrid | TwoLe
 def component_path_lengths(
     components: Sequence[KnownComponent], geometry: ConeBeamGeometry, *, oversampling: int = 1, backend: str = "auto"
 ) -> Tensor:
-    """Path lengths in mm (M, V, rows, cols), one image a material and view, on pixels `oversampling` times finer."""
+    """Path lengths (M, V, rows, cols) in mm, one image per material and view, on pixels `oversampling` times finer."""
     fine = geometry.refined(oversampling) if oversampling > 1 else geometry
     images = []
     for name in known_materials(components):
@@ -68,20 +68,20 @@ def component_shares(
     blur_sigma_px: float = 0.0,
     backend: str = "auto",
 ) -> Iterator[tuple[slice, Tensor]]:
-    """Blocks of views, and the share (K, v, rows, cols) of each energy that the components let through in them.
+    """Blocks of views, each with the energies' shares (K, v, rows, cols) of the signal behind the components.
 
-    Without components the shares are the beam's own (K, 1, 1, 1).
+    Without components the shares are the beam's weights (K, 1, 1, 1).
 
     Args:
-        components: the metal; may be empty.
-        geometry: the views.
-        beam: with one attenuation for each of `known_materials`.
-        oversampling: sub-pixels along each side of a pixel: the mean of exponentials is not that of the mean.
-        blur_sigma_px: the system's blur, detector pixels.
-        backend: of the projection.
+        components: The metal; may be empty.
+        geometry: The views.
+        beam: Beam with one attenuation for each of `known_materials`.
+        oversampling: Sub-pixels along each side of a pixel, because transmissions, not path lengths, are averaged.
+        blur_sigma_px: The system's blur, detector pixels.
+        backend: Projector backend.
 
     Raises:
-        ValueError: the beam lacks the attenuation of a material.
+        ValueError: If the beam lacks the attenuation of a material.
     """
     if len(beam.attenuation) != len(known_materials(components)):
         names = ", ".join(known_materials(components)) or "none"
@@ -102,18 +102,18 @@ def without_components(
     *,
     mineral: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Line integrals b of what is not known, and the derivative of the measured ones to them, both (V, rows, cols).
+    """Line integrals b of the background, and the derivative of the measured ones by them, both (V, rows, cols).
 
-    ``y = -ln sum_k T_k exp(-r_k b)``: known components attenuate and harden the beam as their material and path length
-    say, and the rest is solved for (`background_line_integrals`). With a `BeamModel.monoenergetic` that is
-    ``b = y - sum_m mu_m L_m`` up to the averaging over pixels, the model of Cao et al. 2020. Without components it is
-    the correction of the background's own beam hardening.
+    Solves `y = -ln sum_k T_k exp(-r_k b)` for b (`background_line_integrals`): the known components attenuate and
+    harden the beam according to their material and path length. With a `BeamModel.monoenergetic` this is
+    `b = y - sum_m mu_m L_m` up to the averaging over pixels, the model of Cao et al. 2020. Without components it is
+    a beam hardening correction of the background.
 
     Args:
-        line_integrals: y, without scatter, (V, rows, cols).
-        shares: from `component_shares`, or blocks of views with `behind_metal` of path lengths of the user's own.
-        beam: energies.
-        mineral: line integrals of the part of the background that is mineral, (V, rows, cols); see `mineral_part`.
+        line_integrals: Measured y without scatter, (V, rows, cols).
+        shares: From `component_shares`, or blocks of views with `behind_metal` of your own path lengths.
+        beam: Energies and the background's relative attenuation.
+        mineral: Line integrals of the background's mineral part, (V, rows, cols); see `mineral_part`.
     """
     unknown, slope = torch.empty_like(line_integrals), torch.empty_like(line_integrals)
     for block, share in shares:
@@ -127,13 +127,13 @@ def without_components(
 def with_components(
     volume: Tensor, components: Sequence[KnownComponent], grid: VolumeGrid, values: Sequence[float]
 ) -> Tensor:
-    """``s * mu + mu_implant`` (D, H, W): the background with the metal in its place.
+    """`s * mu + mu_implant` (D, H, W): the background with the metal inserted.
 
     Args:
-        volume: background, (D, H, W).
-        components: the metal.
-        grid: the voxels.
-        values: attenuation of each of `known_materials`, 1/mm.
+        volume: Background, (D, H, W).
+        components: The metal.
+        grid: The voxels.
+        values: Attenuation of each of `known_materials`, 1/mm.
     """
     total = volume * unknown_share(components, grid).to(volume)
     for name, value in zip(known_materials(components), values, strict=True):

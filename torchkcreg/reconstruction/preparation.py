@@ -1,4 +1,4 @@
-"""From measured transmissions to what a reconstruction takes: line integrals and weights, corrected."""
+"""Preparation of measured transmissions for reconstruction: corrected line integrals and weights."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def statistical_weights(
     noise: float = 0.0,
     sensitivity: Tensor | float = 1.0,
 ) -> Tensor:
-    """One over the variance of line integrals, relative to the open beam's: 1 in air, exp(-l) behind something.
+    """Inverse variance of line integrals l, relative to the open beam: 1 in air, exp(-l) behind an object.
 
-    A count of ``primary + scatter`` has its own size as variance (Poisson), and the line integral ``-ln primary`` that
-    over ``primary^2``: ``w = primary^2 / (primary + scatter + noise)``.
+    The variance of a count equals its mean `primary + scatter` (Poisson). The variance of the line integral
+    `-ln primary` is that over `primary^2`, so `w = primary^2 / (primary + scatter + noise)`.
 
     Args:
-        primary: intensity without scatter, in units of the open beam, any shape.
-        scatter: what was taken away before the logarithm, same unit.
+        primary: Intensity without scatter, in units of the open beam, any shape.
+        scatter: Scatter subtracted before the logarithm, same unit.
         mask: 0 where a pixel holds no measurement.
-        noise: variance of the detector's own noise, in the square of counts over the open beam's counts.
-        sensitivity: derivative of the measured line integral to the one that is reconstructed, where these differ
-            (beam hardening); the weights take its square.
+        noise: Variance of the electronic noise in counts squared, over the counts of the open beam.
+        sensitivity: Derivative of the measured line integral by the reconstructed one, if they differ (beam hardening);
+            the weights are multiplied by its square.
 
     >>> statistical_weights(torch.tensor([1.0, 0.5])).tolist()
     [1.0, 0.5]
@@ -50,11 +50,11 @@ def statistical_weights(
 
 @dataclass(frozen=True)
 class PreparedData:
-    """Line integrals to reconstruct, and how much each counts.
+    """Line integrals to reconstruct, and their statistical weights.
 
     Attributes:
-        line_integrals: (V, rows, cols), of the background at the beam's reference energy.
-        weights: same shape, not negative.
+        line_integrals: Line integrals of the background at the beam's reference energy, (V, rows, cols).
+        weights: Statistical weights, same shape, not negative.
     """
 
     line_integrals: Tensor
@@ -77,26 +77,26 @@ def prepare(
     oversampling: int = 4,
     backend: str = "auto",
 ) -> PreparedData:
-    """Scatter taken away, the logarithm with a floor, known components and beam hardening accounted for.
+    """Subtract scatter, take the logarithm, and correct for known components and beam hardening.
 
-    With `components` the line integrals are those of everything else (KC-Rec), without them those of all there is. In
-    both the background's beam hardening is corrected as the beam says; a `BeamModel.monoenergetic` corrects nothing.
-    The weights are the same but for the hardening's derivative.
+    With `components` the line integrals are those of everything except the components (KC-Rec), otherwise those of the
+    whole object. In both cases the background's beam hardening is corrected with the beam model; a
+    `BeamModel.monoenergetic` corrects nothing. The weights differ only by the derivative of the hardening.
 
     Args:
-        transmission: measured intensity over the open beam's, (V, rows, cols).
-        geometry: the views.
-        beam: with the attenuation of the components' materials.
-        components: metal in its registered place.
-        shares: `component_shares` of these, where they are at hand already or come from a projector of the user's own.
-        scatter: a fitted or given veil, or an image of the scatter in units of the open beam.
-        mask: 0 where a pixel holds no measurement: it is filled from its neighbours, see `filled`, and has no weight.
-        floor: smallest transmission taken at its word.
-        noise: see `statistical_weights`.
-        blur_sigma_px: the system's blur for the components' projections, detector pixels.
-        mineral: line integrals of mineral, (V, rows, cols), from an earlier reconstruction; see `mineral_part`.
-        oversampling: sub-pixels along each side of a pixel for the components' projections.
-        backend: of the projection.
+        transmission: Measured intensity over the open beam's, (V, rows, cols).
+        geometry: The views.
+        beam: Beam with the attenuation of the components' materials.
+        components: Registered metal components.
+        shares: `component_shares` of these, if already computed or from your own projector.
+        scatter: A fitted or given veil, or an image of the scatter in units of the open beam.
+        mask: 0 where a pixel holds no measurement; such pixels are filled from neighbours (`filled`) and get weight 0.
+        floor: Smallest transmission used, see `floored_line_integrals`.
+        noise: See `statistical_weights`.
+        blur_sigma_px: The system's blur for the components' projections, detector pixels.
+        mineral: Line integrals of mineral, (V, rows, cols), from an earlier reconstruction; see `mineral_part`.
+        oversampling: Sub-pixels along each side of a pixel for the components' projections.
+        backend: Projector backend.
 
     >>> import torch
     >>> from torchkcreg.geometry import circular_geometry

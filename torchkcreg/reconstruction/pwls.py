@@ -23,19 +23,19 @@ BLOCK_VIEWS = 16  # projected together outside of subsets, to bound memory
 
 
 def ordered_subsets(num_views: int, num_subsets: int, *, sources: Sequence[str] | None = None) -> list[list[int]]:
-    """Views of each subset, in the order in which to visit them.
+    """Views of each subset, in the order in which the subsets are visited.
 
-    Views are dealt out like cards, focal spot by focal spot. Taking every n-th view instead would give subsets of one
-    focal spot each where the firing order's period divides n. Subsets are visited in bit-reversed order, so that one
-    differs as much as can be from those before.
+    Views are distributed over the subsets in turn, focal spot by focal spot. Taking every n-th view instead could give
+    subsets with a single focal spot each, if the period of the firing order divides n. Subsets are visited in
+    bit-reversed order, so that successive subsets differ as much as possible.
 
     Args:
-        num_views: V.
-        num_subsets: at most V.
-        sources: label of each view.
+        num_views: Number of views V.
+        num_subsets: Number of subsets, at most V.
+        sources: Label of each view.
 
     Raises:
-        ValueError: a number of subsets that is not between 1 and V, or labels that don't match.
+        ValueError: If the number of subsets is not between 1 and V, or the number of labels is not V.
 
     >>> ordered_subsets(8, 2, sources=list("ababcdcd"))
     [[0, 1, 4, 5], [2, 3, 6, 7]]
@@ -50,7 +50,7 @@ def ordered_subsets(num_views: int, num_subsets: int, *, sources: Sequence[str] 
 
 
 def bit_reversed(count: int) -> list[int]:
-    """The numbers below count in the order of their reversed bits.
+    """Numbers below `count` in bit-reversed order.
 
     >>> bit_reversed(6)
     [0, 4, 2, 1, 5, 3]
@@ -64,9 +64,9 @@ class Reconstruction:
     """A reconstructed volume.
 
     Attributes:
-        volume: attenuation (D, H, W), 1/mm.
-        history: one record an iteration: iteration, subsets, objective (exact where asked for, else None), estimate
-            (the objective with each subset's residual as it was met), change (RMS over the voxels, 1/mm), seconds.
+        volume: Attenuation (D, H, W), 1/mm.
+        history: One record per iteration: iteration, subsets, objective (exact if requested, else None), estimate
+            (the objective from the subsets' residuals before their steps), change (RMS over the voxels, 1/mm), seconds.
     """
 
     volume: Tensor
@@ -75,12 +75,12 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class SubsetStage:
-    """Some iterations with one number of ordered subsets.
+    """Consecutive iterations with the same number of ordered subsets.
 
     Attributes:
-        iterations: how many.
-        subsets: how many.
-        momentum: whether steps start from a point ahead.
+        iterations: Number of iterations.
+        subsets: Number of subsets.
+        momentum: True if steps start from the extrapolated point.
     """
 
     iterations: int
@@ -88,7 +88,11 @@ class SubsetStage:
     momentum: bool = True
 
     def check(self, num_views: int) -> None:
-        """Nothing; ValueError where there are more subsets than views."""
+        """Check that there are not more subsets than views.
+
+        Raises:
+            ValueError: If there are.
+        """
         if self.subsets > num_views:
             raise ValueError(f"subsets must be at most the number of views {num_views}, got {self.subsets}")
 
@@ -97,14 +101,13 @@ class PWLSConfig(Config):
     """Options of `pwls`.
 
     Attributes:
-        iterations: passes through all views.
-        subsets: ordered subsets at the start.
-        momentum: Nesterov's momentum. The number of subsets then halves after each quarter of the iterations, which
-            keeps the errors of subsets from adding up in the momentum and lets the run converge.
-        beta: weight of the roughness, in the unit of the weights times mm^2.
-        nonnegative: no attenuation below zero.
-        objective_every: compute the exact objective after every so many iterations (half as much work as an iteration);
-            0: never.
+        iterations: Passes through all views.
+        subsets: Number of ordered subsets at the start.
+        momentum: Nesterov's momentum. The number of subsets is then halved after each quarter of the iterations, which
+            keeps subset errors from accumulating in the momentum and lets the run converge.
+        beta: Weight of the roughness, in the unit of the weights times mm^2.
+        nonnegative: Constrain attenuation to be at least zero.
+        objective_every: Compute the exact objective every so many iterations (half the cost of an iteration); 0: never.
 
     >>> PWLSConfig.preset("paper").stages()
     [SubsetStage(iterations=500, subsets=20, momentum=False)]
@@ -127,7 +130,7 @@ class PWLSConfig(Config):
         return cls(**changes)
 
     def stages(self) -> list[SubsetStage]:
-        """The run's stages."""
+        """Stages of the run."""
         if not self.momentum:
             return [SubsetStage(self.iterations, self.subsets, False)]
         quarters = [self.iterations * (i + 1) // 4 - self.iterations * i // 4 for i in range(4)]
@@ -138,7 +141,7 @@ class PWLSConfig(Config):
         return stages
 
     def stage(self, iteration: int) -> SubsetStage:
-        """The stage of an iteration, counted from 0."""
+        """Stage of an iteration, counted from 0."""
         stages = self.stages()
         for stage in stages:
             if iteration < stage.iterations:
@@ -148,26 +151,27 @@ class PWLSConfig(Config):
 
 
 class PWLS:
-    """The minimiser of ``1/2 sum_i w_i ([A (s x)]_i - l_i)^2 + beta R(x)`` over volumes x, not negative.
+    """Minimiser of `1/2 sum_i w_i ([A (s x)]_i - l_i)^2 + beta R(x)` over nonnegative volumes x.
 
-    An iteration goes once through all views, subset by subset. Each subset's step divides the gradient by the curvature
-    of separable parabolas above the objective (Erdogan and Fessler 1999); with momentum the steps start from a point
-    ahead (Nesterov 1983; ordered subsets: Kim, Ramani and Fessler 2015). Ordered subsets circle around the minimum
-    instead of reaching it, so the configuration may let their number fall.
+    One iteration passes once through all views, subset by subset. Each subset's step divides the gradient by the
+    curvature of separable paraboloidal surrogates of the objective (Erdogan and Fessler 1999). With momentum the steps
+    start from an extrapolated point (Nesterov 1983; ordered subsets: Kim, Ramani and Fessler 2015). Ordered subsets
+    end in a limit cycle around the minimum instead of reaching it, so with momentum the number of subsets is reduced
+    during the run.
 
     Args:
-        system: projector, one of the user's own or `VoxelSystem`.
-        line_integrals: l, (V, rows, cols).
-        weights: w, same shape, not negative; see `statistical_weights`.
-        config: iterations, subsets, beta, ...
-        mask: s, of the volumes' shape, between 0 and 1, the share of each voxel that is unknown; 1 if None. What
-            is masked is filled smoothly by the roughness.
-        initial: start volume; zeros if None.
-        roughness: R; of cubes if None.
-        shard: the share of the views that this process works on.
+        system: Projector: `VoxelSystem` or your own.
+        line_integrals: Line integrals l, (V, rows, cols).
+        weights: Weights w, same shape, not negative; see `statistical_weights`.
+        config: Iterations, subsets, beta, ...
+        mask: Mask s, of the volumes' shape: the share of each voxel that is unknown, between 0 and 1; 1 if None. Masked
+            voxels are filled smoothly by the roughness.
+        initial: Initial volume; zeros if None.
+        roughness: Roughness R; that of cubic voxels if None.
+        shard: Views that this process works on, see `ViewShard`.
 
     Raises:
-        ValueError: shapes that don't fit, numbers that are not finite, negative weights, or none above zero.
+        ValueError: If shapes do not match, values are not finite, weights are negative, or no weight is above zero.
     """
 
     def __init__(
@@ -206,7 +210,7 @@ class PWLS:
             raise ValueError(
                 f"weights must have the line integrals' shape {tuple(data.shape)}, got {tuple(weights.shape)}"
             )
-        least = torch.stack([view.min() for view in weights])  # view by view: there may be more than memory holds
+        least = torch.stack([view.min() for view in weights])  # view by view: the data may be larger than memory
         most = torch.stack([view.max() for view in weights])
         sums = torch.stack([view.sum() for view in data])
         for name, values in (("line_integrals", sums), ("weights", least + most)):
@@ -224,11 +228,11 @@ class PWLS:
         self.config.stage(0).check(self.system.num_views)
 
     def _own(self, views: Sequence[int]) -> list[int]:
-        """Those of the views that this process works on."""
+        """Subset of the views that this process works on."""
         if self.shard is None:
             return list(views)
-        own = set(self.shard.views)
-        return [view for view in views if view in own]
+        local_views = set(self.shard.views)
+        return [view for view in views if view in local_views]
 
     def _total(self, tensor: Tensor) -> Tensor:
         return tensor if self.shard is None else self.shard.sum(tensor)
@@ -237,7 +241,7 @@ class PWLS:
         return volume if self.mask is None else volume * self.mask
 
     def _curvature(self) -> Tensor:
-        """``s A' W A s 1 + 2 beta deg``, (D, H, W), positive."""
+        """Curvature `s A' W A s 1 + 2 beta deg`, (D, H, W), positive."""
         total = torch.zeros_like(self.volume)
         ones = self._masked(torch.ones_like(self.volume))
         for views in self._blocks():
@@ -245,7 +249,7 @@ class PWLS:
             total += self.system.backproject(paths * self.weights[views], views)
         data = self._masked(self._total(total))
         if not bool((data > 0).any()):
-            raise ValueError("the volume lies outside the field of view: no ray of any weight crosses it")
+            raise ValueError("the volume lies outside the field of view: no ray with positive weight crosses it")
         rough = self.config.beta * self.roughness.curvature(self.volume)
         return (data + rough).clamp_min(1e-6 * float(data.max()))
 
@@ -254,7 +258,7 @@ class PWLS:
         return [views[start : start + BLOCK_VIEWS] for start in range(0, len(views), BLOCK_VIEWS)]
 
     def objective(self, volume: Tensor | None = None) -> float:
-        """The objective of a volume, of the present one if None; one pass through all views."""
+        """Objective of a volume, by default the current one; needs a projection of all views."""
         volume = self.volume if volume is None else volume
         misfit = torch.zeros((), dtype=torch.float64, device=volume.device)
         for views in self._blocks():
@@ -263,11 +267,12 @@ class PWLS:
         return float(self._total(misfit)) + self.config.beta * float(self.roughness.value(volume))
 
     def step(self) -> dict[str, Any]:
-        """One iteration; returns its record."""
+        """Run one iteration and return its record."""
         start, before = time.perf_counter(), self.volume
         stage = self.config.stage(self.iteration)
         if self.iteration and stage.subsets != self.config.stage(self.iteration - 1).subsets:
-            self.ahead, self.pace = self.volume.clone(), 1.0  # the momentum of other subsets' errors is none
+            # restart: the old momentum contains errors of the old subsets
+            self.ahead, self.pace = self.volume.clone(), 1.0
         subsets = ordered_subsets(self.system.num_views, stage.subsets, sources=self.system.sources)
         misfit = sum(self._sub_iteration(v, self.system.num_views / len(v), stage.momentum) for v in subsets)
         rough = float(self.roughness.value(self.volume))
@@ -285,14 +290,14 @@ class PWLS:
         return record
 
     def _sub_iteration(self, views: list[int], scale: float, momentum: bool) -> float:
-        """Moves the volume by a subset's step; returns the subset's misfit before."""
-        own, point = self._own(views), self.ahead if momentum else self.volume
+        """Update the volume with one subset; returns the subset's misfit before the step."""
+        local_views, point = self._own(views), self.ahead if momentum else self.volume
         gradient, misfit = torch.zeros_like(point), torch.zeros((), dtype=torch.float64, device=point.device)
-        if own:
-            residual = self.system.project(self._masked(point), own) - self.data[own]
-            weighted = self.weights[own] * residual
+        if local_views:
+            residual = self.system.project(self._masked(point), local_views) - self.data[local_views]
+            weighted = self.weights[local_views] * residual
             misfit += 0.5 * (weighted * residual).sum(dtype=torch.float64)
-            gradient += self.system.backproject(weighted, own)
+            gradient += self.system.backproject(weighted, local_views)
         gradient = self._masked(self._total(gradient)).mul_(scale)
         gradient.add_(self.roughness.gradient(point), alpha=self.config.beta)
         stepped = point - gradient.div_(self.curvature)
@@ -308,12 +313,12 @@ class PWLS:
     def run(
         self, *, callbacks: Sequence[Callback] = (), number: int = 0, progress: bool | None = False
     ) -> Reconstruction:
-        """The reconstruction after all iterations that are left.
+        """Run the remaining iterations and return the reconstruction.
 
         Args:
-            callbacks: called at the start and end, with the configuration, and after each iteration, with its record.
-            number: what they are told of this run: its number among several passes.
-            progress: show a tqdm bar; None: on a terminal only.
+            callbacks: Called at the start and end with the configuration, and after each iteration with its record.
+            number: Number of this run among several passes, given to the callbacks.
+            progress: Show a tqdm bar; None: on a terminal only.
         """
         for callback in callbacks:
             callback.on_stage_start(self, number, self.config)
@@ -329,7 +334,7 @@ class PWLS:
         return Reconstruction(self.volume, self.history)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a resumed run needs besides its inputs: tensors and plain data."""
+        """State for resuming the run, without its inputs: tensors and plain data."""
         return {
             "volume": self.volume,
             "ahead": self.ahead,
@@ -340,10 +345,10 @@ class PWLS:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on where `state_dict` was taken, bit by bit.
+        """Restore a state from `state_dict`; the resumed run is identical bit by bit.
 
         Raises:
-            ValueError: the state is of another configuration or volume.
+            ValueError: If the state belongs to another configuration or volume shape.
         """
         if state["config"] != self.config.model_dump():
             raise ValueError("the checkpoint was made with another configuration")
@@ -365,7 +370,7 @@ def pwls(
     callbacks: Sequence[Callback] = (),
     **options: Any,
 ) -> Reconstruction:
-    """A PWLS reconstruction in one call; arguments as of `PWLS` and `PWLS.run`.
+    """Run a PWLS reconstruction in one call; arguments as for `PWLS` and `PWLS.run`.
 
     >>> from torchkcreg.geometry import VolumeGrid, circular_geometry
     >>> from torchkcreg.reconstruction import VoxelSystem

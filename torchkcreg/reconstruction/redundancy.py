@@ -1,4 +1,4 @@
-"""How often each ray of a circular scan was measured: angular steps, Parker weights, offset detectors."""
+"""Redundancy of the rays of a circular scan: angular steps, Parker weights, offset detectors."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-FULL_SCAN_GAP = 1.5  # a largest gap beyond this many usual steps is where a scan begins and ends
+FULL_SCAN_GAP = 1.5  # a largest gap of more than this many typical steps marks the start and end of a short scan
 SHORTEST_SCAN_DEG = 179.0
-OFFSET_SHARE = 0.1  # of its width, by which a detector must stand off the middle to count as an offset one
+OFFSET_SHARE = 0.1  # a detector shifted by at least this share of its width counts as offset
 
 
 @dataclass(frozen=True)
 class AngularSampling:
-    """Where the views of one circular scan stand.
+    """Angles and angular steps of the views of one circular scan.
 
     Attributes:
-        angles: (V,) radians from the beginning of the scan, between 0 and `scan_range`.
-        steps: (V,) radians that each view stands for; they add up to `scan_range`.
-        scan_range: radians that the scan covers, half a step beyond its ends.
-        full: whether it goes all around.
+        angles: (V,) angles from the start of the scan, radians, between 0 and `scan_range`.
+        steps: (V,) angular interval that each view covers, radians; they add up to `scan_range`.
+        scan_range: Angular range of the scan, half a step beyond its ends, radians.
+        full: True for a full turn.
     """
 
     angles: Tensor
@@ -31,12 +31,13 @@ class AngularSampling:
 
 
 def angular_sampling(angles: Tensor) -> AngularSampling:
-    """The steps of views at gantry angles (V,) in radians, any order, any number of turns.
+    """Angular sampling of views at gantry angles (V,) in radians, in any order and over any number of turns.
 
-    The largest gap between neighbours tells a short scan (it begins after the gap) from a full one (no gap stands out).
+    The largest gap between neighbours distinguishes a short scan, which starts after that gap, from a full scan, which
+    has no conspicuous gap.
 
     Raises:
-        ValueError: fewer than 3 views, or less than half a turn.
+        ValueError: If there are fewer than 3 views or they cover less than half a turn.
 
     >>> sampling = angular_sampling(torch.arange(0.0, 200.0).deg2rad())
     >>> sampling.full, round(math.degrees(sampling.scan_range), 3)
@@ -62,22 +63,22 @@ def angular_sampling(angles: Tensor) -> AngularSampling:
     start = turned[order[0]] - before[0] / 2
     scan_range = float(steps.sum())
     if not full and math.degrees(scan_range) < SHORTEST_SCAN_DEG:
-        raise ValueError(f"the views cover {math.degrees(scan_range):.1f} degrees, FDK needs 180 and the fan angle")
+        raise ValueError(f"the views cover {math.degrees(scan_range):.1f} degrees, FDK needs 180 plus the fan angle")
     return AngularSampling((turned - start) % (2 * math.pi), steps, scan_range, full)
 
 
 def parker_weights(angles: Tensor, fan_angles: Tensor, scan_range: float) -> Tensor:
-    """Weights (V, cols) of a short scan's rays that make each line count once (Parker 1982).
+    """Parker weights (V, cols) of a short scan: each line counts once (Parker 1982).
 
-    The ray at gantry angle b and fan angle g is measured again, backwards, at ``b + pi - 2 g`` and ``-g``. With
-    ``d = (scan_range - pi) / 2`` the weight rises as ``sin^2(pi/4 b / (d + g))`` while ``b < 2 (d + g)``, falls as
-    ``sin^2(pi/4 (pi + 2 d - b) / (d - g))`` where ``b > pi + 2 g``, and is 1 between. Rays outside a fan of +-d that
-    the scan saw once have weight 1; those it never saw are missing, and nothing makes up for them.
+    The ray at gantry angle b and fan angle g is measured again, backwards, at `b + pi - 2 g` and `-g`. With
+    `d = (scan_range - pi) / 2` the weight rises as `sin^2(pi/4 b / (d + g))` while `b < 2 (d + g)`, falls as
+    `sin^2(pi/4 (pi + 2 d - b) / (d - g))` where `b > pi + 2 g`, and is 1 between. Outside a fan of +-d,
+    rays measured once have weight 1; rays that were never measured are missing and are not compensated.
 
     Args:
-        angles: (V,) radians from the beginning of the scan.
-        fan_angles: (V, cols) or (cols,) radians, positive towards growing gantry angle.
-        scan_range: radians, between pi and 2 pi.
+        angles: (V,) angles from the start of the scan, radians.
+        fan_angles: (V, cols) or (cols,), radians, positive towards increasing gantry angle.
+        scan_range: Angular range of the scan, between pi and 2 pi.
 
     >>> at_the_start = parker_weights(torch.tensor([0.0, 1.5]), torch.zeros(1), math.pi + 0.2)
     >>> at_the_start.flatten().tolist()
@@ -93,14 +94,14 @@ def parker_weights(angles: Tensor, fan_angles: Tensor, scan_range: float) -> Ten
 
 
 def full_scan_weights(positions: Tensor, radius: float | Tensor) -> Tensor:
-    """Weights (..., cols) of a full scan: a half for each of the two times a line was measured.
+    """Weights (..., cols) of a full scan: 0.5 for each of the two measurements of a line.
 
-    On a detector that stands off the middle by a tenth of its width or more, lines of one side are measured once; the
-    weight goes smoothly from 0 at the near end over the part seen twice to 1 (Wang 2002).
+    With a detector offset by a tenth of its width or more, the lines on one side are measured only once. The weight
+    then rises smoothly across the part measured twice, from 0 at the short end to 1 (Wang 2002).
 
     Args:
-        positions: (..., cols) mm of the columns from the central ray, on the axis of rotation.
-        radius: distance from source to axis, mm.
+        positions: Column positions relative to the central ray, at the axis of rotation, (..., cols), mm.
+        radius: Source-to-axis distance, mm.
     """
     if not is_offset(positions):
         return torch.full_like(positions, 0.5)
@@ -112,6 +113,6 @@ def full_scan_weights(positions: Tensor, radius: float | Tensor) -> Tensor:
 
 
 def is_offset(positions: Tensor) -> bool:
-    """Whether columns at these mm from the central ray are those of a detector off the middle, which it still holds."""
+    """True if columns at these positions (mm) belong to an offset detector that still contains the central ray."""
     low, high = float(positions.min()), float(positions.max())
     return low < 0 < high and abs(low + high) >= OFFSET_SHARE * (high - low)

@@ -1,4 +1,4 @@
-"""The views of a scan, block by block, from memory or as they are read; what is made of them, in memory or on disk."""
+"""Access to a scan's views by blocks, from memory or a reader, and working arrays in memory or on disk."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ ReadViews = Callable[[list[int]], tuple[Tensor, Tensor | None]]
 
 @dataclass(frozen=True)
 class ViewShard:
-    """The views that this process works on; all processes together have each view once.
+    """Views that this process works on; over all processes each view occurs once.
 
-    Each process holds the whole volume and, if it likes, only its own projections. Sums over views are sums over
-    processes (`all_reduce`, Gloo or NCCL): a scan takes its share of time, and results agree with those of one process
+    Each process holds the whole volume and needs only the projections of its shard. Sums over views become sums over
+    processes (`all_reduce`, Gloo or NCCL), so n processes share the work. Results agree with those of a single process
     to rounding.
 
     Attributes:
-        views: this process's views.
-        group: the processes; the default group if None. Without torch.distributed a shard sums nothing.
+        views: This process's views.
+        group: Process group; the default group if None. Without torch.distributed `sum` changes nothing.
 
     >>> ViewShard.of(10).views == list(range(10))
     True
@@ -37,19 +37,19 @@ class ViewShard:
 
     @classmethod
     def of(cls, num_views: int, *, group: distributed.ProcessGroup | None = None) -> ViewShard:
-        """Every n-th view, n the number of processes; all views where torch.distributed is not running."""
+        """Every n-th view for n processes; all views if torch.distributed is not running."""
         if not _running():
             return cls(list(range(num_views)))
         rank, size = distributed.get_rank(group), distributed.get_world_size(group)
         return cls(list(range(rank, num_views, size)), group)
 
     def within(self, views: Sequence[int]) -> ViewShard:
-        """The shard of a selection of views, counted within the selection."""
-        own = set(self.views)
-        return ViewShard([i for i, view in enumerate(views) if view in own], self.group)
+        """Shard of a selection of views, with indices into the selection."""
+        shard_views = set(self.views)
+        return ViewShard([i for i, view in enumerate(views) if view in shard_views], self.group)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """The tensor summed over the processes, in place."""
+        """Sum the tensor over the processes, in place."""
         if _running():
             distributed.all_reduce(tensor, group=self.group)
         return tensor
@@ -60,19 +60,19 @@ def _running() -> bool:
 
 
 def views_reader(transmission: Tensor | ReadViews, mask: Tensor | None, shape: Sequence[int]) -> ReadViews:
-    """A function of views that gives their transmission and mask, both (v, rows, cols), or None where all pixels hold.
+    """Function that returns transmission and mask, (v, rows, cols), of given views; mask None if all pixels are valid.
 
     Args:
-        transmission: of all views, (V, rows, cols), or such a function already.
-        mask: 0 where a pixel holds no measurement, (V, rows, cols); every pixel does if None.
-        shape: (V, rows, cols) as they must be.
+        transmission: Transmission of all views, (V, rows, cols), or already such a function.
+        mask: 0 where a pixel holds no measurement, (V, rows, cols); all pixels are valid if None.
+        shape: Expected shape (V, rows, cols).
 
     Raises:
-        ValueError: a transmission of another shape, or a mask beside a function, which gives its own.
+        ValueError: If a shape is wrong, or a mask is given in addition to a function, which returns its own masks.
     """
     if not isinstance(transmission, Tensor):
         if mask is not None:
-            raise ValueError("a function of views gives their masks as well: leave out mask")
+            raise ValueError("a function of views also returns their masks: leave out mask")
         return transmission
     for name, tensor in (("transmission", transmission), ("mask", mask)):
         if tensor is not None and tuple(tensor.shape) != tuple(shape):
@@ -85,27 +85,26 @@ def views_reader(transmission: Tensor | ReadViews, mask: Tensor | None, shape: S
 
 
 class Workspace:
-    """Where large arrays of a scan go: memory, or files in a folder, of which the system keeps what fits in memory.
+    """Allocates large arrays of a scan in memory or as memory-mapped files in a folder.
 
     Args:
-        folder: an existing folder; memory if None. The arrays' files are unlinked as soon as they are open, so that
-            nothing is left behind.
+        folder: An existing folder; memory if None. The files are unlinked as soon as they are open, so no files remain.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder
 
     def empty(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """An array of a shape, of another's type, to be filled.
+        """Uninitialised array of the given shape, with the type of `like`.
 
         Raises:
-            OSError: the folder's disk has no room for it.
+            OSError: If the folder's disk has not enough free space.
         """
         if self.folder is None:
             return like.new_empty(tuple(shape))
         size = math.prod(int(count) for count in shape)
         needed, free = size * like.element_size(), shutil.disk_usage(self.folder).free
-        if needed > free:  # a mapped file that outgrows its disk would end the process
+        if needed > free:  # writing a mapped file to a full disk would kill the process
             raise OSError(f"{self.folder} has room for {free / 2**30:.1f} GiB, {needed / 2**30:.1f} GiB are needed")
         path = self.folder / f"array-{os.getpid()}-{size}"
         array = torch.from_file(str(path), shared=True, size=size, dtype=like.dtype, device="cpu")

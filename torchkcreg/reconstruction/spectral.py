@@ -1,4 +1,4 @@
-"""What the metal leaves of the beam: line integrals of the background behind known components, with beam hardening."""
+"""Polyenergetic beam model: line integrals of the background behind known components, with beam hardening."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 from torchkcreg.physics import Beam, Material, Spectrum, calcium_attenuation, gaussian_blur, material
 
 _STEPS = 4096
-_DARKEST = 12.0  # line integral beyond which nothing is told apart
+_DARKEST = 12.0  # largest line integral in the table
 NEWTON_STEPS = 8
 LEAST_LINE_INTEGRAL = -0.5
-CLEARLY_ABOVE = 0.1  # as a share of water: more than noise and fatty or muscular tissue do
+CLEARLY_ABOVE = 0.1  # relative to water: more than noise and variations of soft tissue
 
 
 def path_lengths_through(transmission: Tensor, substance: Material, spectrum: Spectrum) -> Tensor:
-    """Path lengths in mm, of the shape of the transmissions, through an object of one material: no beam hardening.
+    """Path lengths in mm through an object of one material, corrected for beam hardening, in the transmission's shape.
 
-    The inverse of ``T(L) = sum_k w_k exp(-mu_k L)``, interpolated in ``-ln T``; below no material at all (brighter than
-    the open beam) as for monoenergetic light, so that noise has no bias.
+    Inverts `T(L) = sum_k w_k exp(-mu_k L)` by interpolation in `-ln T`. Pixels brighter than the open beam get negative
+    lengths by linear extrapolation, so that noise is not biased.
 
     Args:
-        transmission: Measured intensity over the open beam's, scatter taken away; positive.
-        substance: What the object is of.
-        spectrum: As detected.
+        transmission: Measured intensity over the open beam's, with scatter subtracted; positive.
+        substance: The object's material.
+        spectrum: Detected spectrum.
     """
     weights = torch.tensor(spectrum.weights, dtype=torch.float64, device="cpu")
     attenuation = substance.attenuation(spectrum.energies_kev)
@@ -43,7 +43,7 @@ def path_lengths_through(transmission: Tensor, substance: Material, spectrum: Sp
 
 
 def hounsfield(attenuation: Tensor, water: float) -> Tensor:
-    """CT numbers in HU, ``1000 (mu - mu_water) / mu_water``, of attenuation in 1/mm.
+    """CT numbers in HU, `1000 (mu - mu_water) / mu_water`, of attenuation in 1/mm.
 
     >>> import torch
     >>> hounsfield(torch.tensor([0.0, 0.02, 0.03]), 0.02).round().tolist()
@@ -56,17 +56,17 @@ def hounsfield(attenuation: Tensor, water: float) -> Tensor:
 
 @dataclass(frozen=True)
 class BeamModel:
-    """A beam, and the background's attenuation at its energies relative to a reference energy.
+    """Beam spectrum with the background's attenuation at its energies relative to a reference energy.
 
-    The background is taken as one material of changing density, water by default: a line integral b at the reference
-    energy attenuates energy k by ``exp(-r_k b)``.
+    The background is modelled as one material of varying density, water by default: a line integral b at the reference
+    energy attenuates energy k by `exp(-r_k b)`.
 
     Attributes:
         beam: Energies, shares of the signal, and the metals' attenuation.
-        background: (E,), r.
-        mineral: (E,), the same ratio for calcium, which hardens the beam more than water.
-        reference_kev: the energy of the reconstructed attenuation; None where the beam counts as monoenergetic.
-        water: attenuation of water there, 1/mm, for CT numbers.
+        background: Ratio r of the background's attenuation, (E,).
+        mineral: The same ratio for calcium, which hardens the beam more than water, (E,).
+        reference_kev: Energy of the reconstructed attenuation; None for a monoenergetic beam.
+        water: Attenuation of water at the reference energy, for CT numbers, 1/mm.
     """
 
     beam: Beam
@@ -77,12 +77,12 @@ class BeamModel:
 
     @property
     def weights(self) -> Tensor:
-        """(E,) shares of the signal, summing to one."""
+        """Energies' shares of the signal, (E,); they sum to one."""
         return self.beam.weights
 
     @property
     def attenuation(self) -> Tensor:
-        """(M, E) of the metals, 1/mm."""
+        """Attenuation of the metals, (M, E), 1/mm."""
         return self.beam.attenuation
 
     @classmethod
@@ -95,14 +95,14 @@ class BeamModel:
         reference_kev: float | None = None,
         num_bins: int = 12,
     ) -> BeamModel:
-        """The beam of a detected spectrum, reduced to the fewest energies that transmit alike.
+        """Beam model of a detected spectrum, reduced to a few energies with nearly the same transmission.
 
         Args:
-            metals: in the order of the path lengths' M; may be empty.
-            spectrum: as detected.
-            background: water if None.
-            reference_kev: the spectrum's mean energy if None.
-            num_bins: the most energies kept.
+            metals: Metals in the order of the path lengths; may be empty.
+            spectrum: Detected spectrum.
+            background: Background material; water if None.
+            reference_kev: Reference energy, keV; the spectrum's mean energy if None.
+            num_bins: Maximum number of energies.
         """
         base = material("water") if background is None else background
         energy = spectrum.mean_energy if reference_kev is None else float(reference_kev)
@@ -113,10 +113,10 @@ class BeamModel:
 
     @classmethod
     def behind(cls, beam: Beam, *, background: Material | None = None, reference_kev: float | None = None) -> BeamModel:
-        """A background of one material, water if None, in a beam, at a reference energy, its mean if None.
+        """Beam model of a given beam; the background is water and the reference the beam's mean energy by default.
 
         Raises:
-            ValueError: the beam has several spectra.
+            ValueError: If the beam has several spectra.
         """
         if beam.sources is not None:
             raise ValueError("a reconstruction needs one spectrum for all views, got one for each source")
@@ -134,26 +134,26 @@ class BeamModel:
 
     @classmethod
     def monoenergetic(cls, attenuation: Sequence[float], *, water: float = 0.0205) -> BeamModel:
-        """A beam of one energy, as in Cao et al. 2020: metals of given attenuation in 1/mm."""
-        one = torch.ones(1, dtype=torch.float64)
+        """Beam model of a single energy, as in Cao et al. 2020, from the metals' attenuation in 1/mm."""
+        unit = torch.ones(1, dtype=torch.float64)
         table = torch.tensor(list(attenuation), dtype=torch.float64).reshape(-1, 1)
-        return cls(Beam(torch.zeros_like(one), one, table), one, one, None, water)
+        return cls(Beam(torch.zeros_like(unit), unit, table), unit, unit, None, water)
 
     def without_metals(self) -> BeamModel:
-        """The same beam where there is no metal in it."""
+        """The same beam model without metals."""
         beam = self.beam
         return replace(self, beam=Beam(beam.energies_kev, beam.weights, beam.attenuation[:0]))
 
 
 def behind_metal(path_lengths: Tensor, beam: BeamModel, *, pooling: int = 1, blur_sigma_px: float = 0.0) -> Tensor:
-    """Share of each energy that metals let through, (K, V, rows, cols); sums to the transmission.
+    """Energies' shares of the signal behind metal, (K, V, rows, cols); they sum to the metal's transmission.
 
     Args:
-        path_lengths: (M, V, rows * pooling, cols * pooling) in mm, on pixels finer than the detector's where pooling is
-            above 1: an average of exponentials is not the exponential of the average.
-        beam: energies and attenuation.
-        pooling: side of the squares of pixels whose transmission is averaged.
-        blur_sigma_px: the system's blur, standard deviation in detector pixels.
+        path_lengths: Path lengths (M, V, rows * pooling, cols * pooling), mm. With pooling above 1 the pixels are finer
+            than the detector's, because transmissions, not path lengths, must be averaged.
+        beam: Energies and attenuation.
+        pooling: Side length of the blocks of pixels whose transmission is averaged.
+        blur_sigma_px: The system's blur, standard deviation in detector pixels.
     """
     if path_lengths.dim() != 4 or len(path_lengths) != len(beam.attenuation):
         raise ValueError(
@@ -174,21 +174,21 @@ def behind_metal(path_lengths: Tensor, beam: BeamModel, *, pooling: int = 1, blu
 def transmitted_behind(
     background: Tensor, shares: Tensor, beam: BeamModel, *, mineral: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """``-ln sum_k T_k exp(-r_k b)`` of line integrals b of the background, and its derivative to them.
+    """`-ln sum_k T_k exp(-r_k b)` for background line integrals b, and its derivative by b.
 
-    Where a part m of b is mineral, energy k sees ``r_k (b - m) + r'_k m`` with r' the mineral's own ratio.
+    If a part m of b is mineral, `r_k b` becomes `r_k (b - m) + r'_k m` with r' the mineral's ratio.
 
     Args:
-        background: b, (V, rows, cols).
-        shares: T, (K, V, rows, cols), from `behind_metal`; or (K,), the beam's own weights, where there is no metal.
-        beam: energies.
-        mineral: m, (V, rows, cols); none if not given.
+        background: Line integrals b, (V, rows, cols).
+        shares: Shares T, (K, V, rows, cols), from `behind_metal`; without metal the beam's weights, (K,).
+        beam: Energies and the background's relative attenuation.
+        mineral: Mineral part m, (V, rows, cols); none if not given.
     """
     logs = shares.clamp_min(1e-30).log().to(background)
     parts = []
-    for k, (ratio, other) in enumerate(zip(beam.background.tolist(), beam.mineral.tolist(), strict=True)):
+    for k, (ratio, mineral_ratio) in enumerate(zip(beam.background.tolist(), beam.mineral.tolist(), strict=True)):
         part = logs[k] - ratio * background
-        parts.append(part if mineral is None else part.sub_(mineral, alpha=other - ratio))
+        parts.append(part if mineral is None else part.sub_(mineral, alpha=mineral_ratio - ratio))
     stacked = torch.stack(parts)
     total = torch.logsumexp(stacked, dim=0)
     mixture = torch.exp(stacked.sub_(total))
@@ -199,16 +199,16 @@ def transmitted_behind(
 def background_line_integrals(
     line_integrals: Tensor, shares: Tensor, beam: BeamModel, *, mineral: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Line integrals b of the background and the derivative of the measured ones to them, both (V, rows, cols).
+    """Line integrals b of the background and the derivative of the measured ones by b, both (V, rows, cols).
 
-    Solves ``-ln sum_k T_k exp(-r_k b) = y`` by Newton's method: the left side is concave and rising in b, so the
+    Solves `-ln sum_k T_k exp(-r_k b) = y` by Newton's method: the left side is concave and increasing in b, so the
     iteration converges from below.
 
     Args:
-        line_integrals: y, measured, without scatter, (V, rows, cols).
-        shares: as in `transmitted_behind`.
-        beam: energies.
-        mineral: as in `transmitted_behind`, from `mineral_part` of an earlier reconstruction.
+        line_integrals: Measured y without scatter, (V, rows, cols).
+        shares: As in `transmitted_behind`.
+        beam: Energies and the background's relative attenuation.
+        mineral: As in `transmitted_behind`, from `mineral_part` of an earlier reconstruction.
     """
     b, slope = torch.zeros_like(line_integrals), torch.ones_like(line_integrals)
     for _ in range(NEWTON_STEPS if len(beam.weights) > 1 else 1):
@@ -218,12 +218,12 @@ def background_line_integrals(
 
 
 def mineral_part(volume: Tensor, beam: BeamModel, *, mask: Tensor | None = None) -> Tensor:
-    """What of a reconstructed background (D, H, W) is mineral, in 1/mm: all above water, where it is clearly above.
+    """Mineral part of a reconstructed background (D, H, W), 1/mm: excess over water in voxels clearly above it.
 
     Args:
-        volume: attenuation at the beam's reference energy.
-        beam: knows water there.
-        mask: share of each voxel that is background; 1 if None.
+        volume: Attenuation at the beam's reference energy.
+        beam: Beam model with the attenuation of water at that energy.
+        mask: Share of each voxel that is background; 1 if None.
     """
     smooth = avg_pool3d(volume[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]
     excess = (volume - beam.water).clamp_min(0) * (smooth > (1 + CLEARLY_ABOVE) * beam.water)

@@ -1,4 +1,4 @@
-"""What an iterative reconstruction knows of a scanner: line integrals of a volume, and their adjoint, by views."""
+"""System model of iterative reconstruction: projection of a volume by views, its adjoint, and roughness penalties."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from torch import Tensor, nn
 from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 from torchkcreg.projector import backproject, project_volume
 
-Weights = Sequence[tuple[int, float | Tensor]]  # dimension of neighbours, and the weight of their difference
+Weights = Sequence[tuple[int, float | Tensor]]  # dimension of the neighbours, weight of their difference
 BLOCK_VIEWS = 20  # projected together
 
 
 class Roughness(Protocol):
-    """A convex measure of how rough a volume is, of the shape that a `System` projects."""
+    """Convex roughness penalty of volumes in the shape that a `System` projects."""
 
     def value(self, volume: Tensor) -> Tensor:
         """The roughness, a scalar."""
 
     def gradient(self, volume: Tensor) -> Tensor:
-        """Its derivative, of the volume's shape."""
+        """Derivative of the roughness, of the volume's shape."""
 
     def curvature(self, volume: Tensor) -> Tensor:
-        """Curvatures, of the volume's shape, of separable parabolas above it."""
+        """Curvatures of separable parabolas that majorise it, of the volume's shape."""
 
 
 class VoxelRoughness:
-    """`quadratic_roughness` of volumes of one spacing, as a `Roughness`.
+    """`quadratic_roughness` of volumes with a given voxel spacing, as a `Roughness`.
 
     Args:
-        spacing: of the voxels (x, y, z), mm.
+        spacing: Voxel spacing (x, y, z), mm.
     """
 
     def __init__(self, spacing: Sequence[float] = (1.0, 1.0, 1.0)) -> None:
@@ -43,19 +43,19 @@ class VoxelRoughness:
         return pair_roughness(volume, self.weights)
 
     def gradient(self, volume: Tensor) -> Tensor:
-        """Its derivative, (D, H, W)."""
+        """Derivative of the roughness, (D, H, W)."""
         return pair_gradient(volume, self.weights)
 
     def curvature(self, volume: Tensor) -> Tensor:
-        """Curvatures (D, H, W) of separable parabolas above it (De Pierro 1995)."""
+        """Curvatures (D, H, W) of separable parabolas that majorise it (De Pierro 1995)."""
         return pair_curvature(volume, self.weights)
 
 
 def quadratic_roughness(volume: Tensor, *, spacing: Sequence[float] = (1.0, 1.0, 1.0)) -> Tensor:
-    """``R = 1/2 sum k (x_i - x_j)^2`` over pairs of face neighbours of a volume (D, H, W); a scalar.
+    """`R = 1/2 sum k (x_i - x_j)^2` over pairs of face neighbours of a volume (D, H, W); a scalar.
 
-    The weight k of a direction is ``(h / d)^2`` with d the voxel's size (x, y, z) along it and h the geometric mean, 1
-    for cubes.
+    The weight of a direction is `k = (h / d)^2`, with d the voxel size along it and h the geometric mean of the voxel
+    sizes (x, y, z); k is 1 for cubes.
 
     >>> quadratic_roughness(torch.tensor([[[0.0, 1.0, 3.0]]])).item()
     2.5
@@ -64,7 +64,7 @@ def quadratic_roughness(volume: Tensor, *, spacing: Sequence[float] = (1.0, 1.0,
 
 
 def pair_roughness(volume: Tensor, weights: Weights) -> Tensor:
-    """``1/2 sum k (x_i - x_j)^2``, a scalar, with weights k of each dimension's pairs of neighbours."""
+    """`1/2 sum k (x_i - x_j)^2`, a scalar, with weights k for each dimension's pairs of neighbours."""
     total = volume.new_zeros((), dtype=torch.float64)
     for dim, weight in weights:
         total = total + 0.5 * (volume.diff(dim=dim).square() * weight).sum(dtype=torch.float64)
@@ -72,7 +72,7 @@ def pair_roughness(volume: Tensor, weights: Weights) -> Tensor:
 
 
 def pair_gradient(volume: Tensor, weights: Weights) -> Tensor:
-    """The derivative of `pair_roughness`, of the volume's shape."""
+    """Derivative of `pair_roughness`, of the volume's shape."""
     gradient = torch.zeros_like(volume)
     for dim, weight in weights:
         size = volume.shape[dim]
@@ -83,7 +83,7 @@ def pair_gradient(volume: Tensor, weights: Weights) -> Tensor:
 
 
 def pair_curvature(volume: Tensor, weights: Weights) -> Tensor:
-    """Curvatures of separable parabolas above `pair_roughness` (De Pierro 1995): ``2 sum_j k``."""
+    """Curvatures of separable parabolas that majorise `pair_roughness` (De Pierro 1995): `2 sum_j k`."""
     curvature = torch.zeros_like(volume)
     for dim, weight in weights:
         size = volume.shape[dim]
@@ -100,12 +100,12 @@ def _directions(spacing: Sequence[float]) -> list[tuple[int, float]]:
 
 
 class System(Protocol):
-    """A linear projector by views. Bring your own, or take `VoxelSystem`.
+    """Linear projector by views. Use `VoxelSystem` or your own.
 
     Attributes:
-        volume_shape: of the volumes: (D, H, W), or what else the projector knows, such as (N,) of two levels of voxels.
-        num_views: V.
-        sources: label of each view's focal spot, or None; ordered subsets then hold all of them evenly.
+        volume_shape: Shape of the volumes: (D, H, W), or another shape such as (N,) for two levels of voxels.
+        num_views: Number of views V.
+        sources: Label of each view's focal spot, or None. With labels, focal spots are spread evenly over the subsets.
     """
 
     @property
@@ -124,22 +124,22 @@ class System(Protocol):
         """Line integrals (len(views), rows, cols) of a volume (D, H, W)."""
 
     def backproject(self, images: Tensor, views: Sequence[int]) -> Tensor:
-        """The adjoint: a volume (D, H, W) from images (len(views), rows, cols)."""
+        """Adjoint projection: a volume (D, H, W) from images (len(views), rows, cols)."""
 
 
 def projected(system: System, volume: Tensor) -> Tensor:
-    """Line integrals (V, rows, cols) of a volume in all views, some at a time."""
+    """Line integrals (V, rows, cols) of a volume in all views, computed in blocks of views."""
     views = range(system.num_views)
     blocks = [views[start : start + BLOCK_VIEWS] for start in range(0, len(views), BLOCK_VIEWS)]
     return torch.cat([system.project(volume, block) for block in blocks])
 
 
 class VoxelSystem(nn.Module):
-    """The library's voxel projector in the views of a geometry.
+    """Voxel projector of this library for the views of a geometry.
 
     Args:
-        geometry: the views.
-        grid: the voxels.
+        geometry: The views.
+        grid: The voxels.
         backend: "auto", "cpp" or "torch".
 
     >>> import torch
@@ -175,7 +175,7 @@ class VoxelSystem(nn.Module):
         return project_volume(volume, self.grid, matrices, self.geometry.det_shape, backend=self.backend)
 
     def backproject(self, images: Tensor, views: Sequence[int]) -> Tensor:
-        """A volume (D, H, W) from images (len(views), rows, cols)."""
+        """Adjoint projection: a volume (D, H, W) from images (len(views), rows, cols)."""
         return backproject(images, self.grid, self.geometry.projection_matrices[list(views)], backend=self.backend)
 
     def extra_repr(self) -> str:

@@ -15,16 +15,16 @@ from .system import VoxelSystem, pair_curvature, pair_gradient, pair_roughness
 
 
 class TwoLevelSystem(nn.Module):
-    """The voxel projector of a `TwoLevelGrid`'s images (N,): a `System`.
+    """Voxel projector of a `TwoLevelGrid`'s images (N,), as a `System`.
 
-    The coarse voxels, divided ones with the mean of their parts, are projected as ever; what the fine ones differ by
-    from the interpolated coarse ones is projected on pixels finer than the detector's. An image of one value is thus
-    the same to the projector wherever the levels meet.
+    All coarse voxels are projected as usual; divided ones have the mean of their fine voxels. The difference between
+    the fine voxels and the interpolated coarse ones is projected on pixels finer than the detector's. Constant images
+    therefore show no step where the levels meet.
 
     Args:
-        geometry: the views.
-        grid: the voxels.
-        oversampling: rays along each side of a pixel through the fine voxels.
+        geometry: The views.
+        grid: The voxels.
+        oversampling: Rays along each side of a pixel, for the fine voxels.
         backend: "auto", "cpp", "triton" or "torch".
     """
 
@@ -61,7 +61,7 @@ class TwoLevelSystem(nn.Module):
         return self.coarse.project(filled, views) + avg_pool2d(images[:, None], self.oversampling)[:, 0]
 
     def backproject(self, images: Tensor, views: Sequence[int]) -> Tensor:
-        """An image (N,) from images (len(views), rows, cols)."""
+        """Adjoint projection: an image (N,) from images (len(views), rows, cols)."""
         grid, n = self.grid, self.oversampling
         shares = (images / n**2).repeat_interleave(n, 1).repeat_interleave(n, 2)
         fine = self.fine.backproject(shares, views).mul_(grid.within)
@@ -76,11 +76,11 @@ class TwoLevelSystem(nn.Module):
 
 
 class TwoLevelRoughness:
-    """``1/2 integral |grad x|^2`` of a `TwoLevelGrid`'s images, over the edge of a coarse voxel: a `Roughness`.
+    """`1/2 integral |grad x|^2` of a `TwoLevelGrid`'s images, divided by the coarse voxel's edge; a `Roughness`.
 
-    Each face between two voxels counts ``area / distance * (x_i - x_j)^2 / 2``, with the distance from centre to centre
-    straight through the face. On a grid that is not divided that is `quadratic_roughness`, and it smooths the same
-    structures alike on either level.
+    Each face between two voxels contributes `area / distance * (x_i - x_j)^2 / 2`, with the centre-to-centre distance
+    measured perpendicular to the face. Without divided voxels this is `quadratic_roughness`. Structures are smoothed
+    equally on both levels.
     """
 
     def __init__(self, grid: TwoLevelGrid) -> None:
@@ -91,14 +91,14 @@ class TwoLevelRoughness:
         n = grid.factor
         for dim, step in zip((-3, -2, -1), reversed(grid.spacing), strict=True):
             large = grid.coarse.voxel_volume / step**2 / edge
-            own, other = _pairs(coarse, dim)
-            self.coarse_weights.append((dim, large * (own & other)))
-            own, other = _pairs(fine, dim)
-            both, one = large / n, large * 2 / (n + n**2)  # area / distance: 1/n^2 over 1/n, and over (1 + 1/n) / 2
-            self.fine_weights.append((dim, both * (own & other) + one * (own ^ other)))
+            first, second = _pairs(coarse, dim)
+            self.coarse_weights.append((dim, large * (first & second)))
+            first, second = _pairs(fine, dim)
+            inner, mixed = large / n, large * 2 / (n + n**2)  # area / distance: 1/n^2 over 1/n, and over (1 + 1/n) / 2
+            self.fine_weights.append((dim, inner * (first & second) + mixed * (first ^ second)))
 
     def _levels(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Coarse values, and fine ones with each coarse value repeated where it is not divided."""
+        """Coarse values, and fine values with undivided coarse values repeated."""
         coarse, fine = self.grid.split(image)
         return coarse, torch.where(self.grid.within, fine, repeated(coarse[self.grid.box], self.grid.factor))
 
@@ -108,17 +108,17 @@ class TwoLevelRoughness:
         return pair_roughness(coarse, self.coarse_weights) + pair_roughness(fine, self.fine_weights)
 
     def gradient(self, image: Tensor) -> Tensor:
-        """Its derivative, (N,)."""
+        """Derivative of the roughness, (N,)."""
         coarse, fine = self._levels(image)
         return self._joined(pair_gradient(coarse, self.coarse_weights), pair_gradient(fine, self.fine_weights))
 
     def curvature(self, image: Tensor) -> Tensor:
-        """Curvatures (N,) of separable parabolas above it."""
+        """Curvatures (N,) of separable parabolas that majorise it."""
         coarse, fine = self._levels(image)
         return self._joined(pair_curvature(coarse, self.coarse_weights), pair_curvature(fine, self.fine_weights))
 
     def _joined(self, coarse: Tensor, fine: Tensor) -> Tensor:
-        """What belongs to the repeated coarse values goes to these."""
+        """Image (N,) of both levels; the terms of repeated coarse values are added to their coarse voxels."""
         grid = self.grid
         coarse[grid.box] += means(fine * ~grid.within, grid.factor) * grid.factor**3
         return grid.join(coarse, fine)

@@ -1,4 +1,4 @@
-"""Iterative reconstruction from measured transmissions in passes: each knows more of scatter and hardening."""
+"""Iterative reconstruction from measured transmissions in passes that refine the scatter and hardening corrections."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class IterativeResult:
-    """A reconstruction from transmissions.
+    """Result of an iterative reconstruction from transmissions.
 
     Attributes:
-        volume: attenuation of the background (D, H, W) at the beam's reference energy, 1/mm; smooth inside metal. On a
+        volume: Attenuation of the background (D, H, W) at the beam's reference energy, 1/mm; smooth inside metal. On a
             `TwoLevelGrid` an image (N,), see `TwoLevelGrid.volumes`.
-        mask: share of each voxel that is background, of the volume's shape; None without components.
-        data: line integrals and weights of the last pass.
-        scatter: in units of the open beam, (V, rows, cols).
-        history: records of the last pass.
+        mask: Share of each voxel that is background, of the volume's shape; None without components.
+        data: Line integrals and weights of the last pass.
+        scatter: Scatter image in units of the open beam, (V, rows, cols).
+        history: Records of the last pass, one per iteration.
     """
 
     volume: Tensor
@@ -69,30 +69,30 @@ def reconstruct(
     progress: bool | None = False,
     folder: Path | None = None,
 ) -> IterativeResult:
-    """PWLS of transmissions, with known components KC-Rec: ``mu_total = s mu + mu_implant``.
+    """Reconstruct transmissions by PWLS; with known components this is KC-Rec: `mu_total = s mu + mu_implant`.
 
-    The first pass takes the background for water as far as beam hardening goes. Each later one knows from the last
-    volume what of a ray is mineral and, behind known metal, how much of the signal must be scatter.
+    The first pass corrects beam hardening as if the background were water. Each later pass uses the previous volume:
+    its mineral part refines the hardening correction, and behind known metal its projection refines the scatter.
 
     Args:
-        transmission: measured intensity over the open beam's, (V, rows, cols). For scans that are larger than memory a
-            function: called with a list of views, it gives their transmission and mask, (v, rows, cols) each.
-        geometry: the views.
-        grid: the voxels; of two levels, only the last pass is made on both, the others on the coarse one.
-        beam: energies, and the attenuation of the components' materials, such as a registration's own.
-        config: of each pass.
-        components: metal in its registered place; none: plain PWLS.
-        scatter: see `prepare`.
+        transmission: Measured intensity over the open beam's, (V, rows, cols). For scans larger than memory, a function
+            that returns transmission and mask, (v, rows, cols) each, of a list of views.
+        geometry: The views.
+        grid: The voxels. With a `TwoLevelGrid` only the last pass uses both levels; earlier ones use the coarse level.
+        beam: Energies and the attenuation of the components' materials, for example from a registration.
+        config: PWLS options of each pass.
+        components: Registered metal components; plain PWLS if empty.
+        scatter: See `prepare`.
         mask: 0 where a pixel holds no measurement.
-        passes: how many; 1 keeps the first estimates.
-        initial: start volume (D, H, W) of the first pass.
-        blur_sigma_px: the system's blur, detector pixels.
-        shard: the share of the views that this process works on.
-        backend: of the projectors.
-        callbacks: called at the start and end of each pass and after each iteration; the run is the solver.
-        state: where an earlier run stopped: "pass", "solver" (its state dict) and "volume", that of the pass before.
-        progress: see `PWLS.run`.
-        folder: for line integrals, weights and scatter of scans that are larger than memory; memory if None.
+        passes: Number of passes; with 1 the initial corrections are not refined.
+        initial: Initial volume (D, H, W) of the first pass.
+        blur_sigma_px: The system's blur, detector pixels.
+        shard: Views that this process works on, see `ViewShard`.
+        backend: Projector backend.
+        callbacks: Called at the start and end of each pass and after each iteration, with the solver as the run.
+        state: State of an interrupted run: "pass", "solver" (its state dict) and "volume" of the previous pass.
+        progress: See `PWLS.run`.
+        folder: Folder for line integrals, weights and scatter of scans larger than memory; memory if None.
     """
     if passes < 1:
         raise ValueError(f"passes must be at least 1, got {passes}")
@@ -100,8 +100,8 @@ def reconstruct(
     coarse = grid.coarse if isinstance(grid, TwoLevelGrid) else grid
     system = VoxelSystem(geometry, coarse, backend=backend)
     shape = (geometry.num_views, *geometry.det_shape)
-    read, kept = views_reader(transmission, mask, shape), isinstance(transmission, Tensor)
-    views = _Views(system, read, beam, components, scatter, blur_sigma_px, keep_shares=kept)
+    read, in_memory = views_reader(transmission, mask, shape), isinstance(transmission, Tensor)
+    views = _Views(system, read, beam, components, scatter, blur_sigma_px, keep_shares=in_memory)
     space, volume, start, done = Workspace(folder), initial, 0, None
     if state is not None:
         start, volume = int(state["pass"]), state["volume"]
@@ -115,12 +115,12 @@ def reconstruct(
         volume = solver.run(callbacks=callbacks, number=index, progress=progress).volume
         done = IterativeResult(volume, solver.mask if components else None, data, scattered, solver.history)
     if done is None:
-        raise ValueError(f"the state is of pass {start}, but there are only {passes}")
+        raise ValueError(f"the state is from pass {start}, but there are only {passes} passes")
     return done
 
 
 class _Views:
-    """A scan's views, some at a time, on their way to line integrals and weights."""
+    """Prepares a scan's line integrals and weights, block by block."""
 
     def __init__(
         self,
@@ -141,7 +141,7 @@ class _Views:
         self.kept: list[tuple[slice, Tensor]] | None = None
 
     def shares(self) -> Iterable[tuple[slice, Tensor]]:
-        """Blocks of views, and what metal lets through in them; kept from pass to pass where there is the memory."""
+        """Blocks of views with their shares behind metal; cached between passes if the scan is in memory."""
         if self.kept is not None:
             return self.kept
         backend, blur = self.system.backend, self.blur_sigma_px
@@ -154,7 +154,7 @@ class _Views:
     def prepared(
         self, volume: Tensor | None, space: Workspace, *, progress: bool | None
     ) -> tuple[PreparedData, Tensor]:
-        """Line integrals and weights of all views, and their scatter, with what a volume (D, H, W) tells of them."""
+        """Line integrals and weights of all views, and their scatter, refined with a volume (D, H, W) if given."""
         geometry = self.system.geometry
         lines, weights, scattered = (
             space.empty((geometry.num_views, *geometry.det_shape), self.like) for _ in range(3)
@@ -167,8 +167,10 @@ class _Views:
         for block, share in self.shares():
             views = list(range(geometry.num_views))[block]
             transmission, mask = self.read(views)
-            own, share = self.scatter, share.to(transmission)
-            first = scatter_image(transmission, own[views] if isinstance(own, Tensor) else own, geometry.pixel_spacing)
+            veil, share = self.scatter, share.to(transmission)
+            first = scatter_image(
+                transmission, veil[views] if isinstance(veil, Tensor) else veil, geometry.pixel_spacing
+            )
             hard = None if mineral is None else self.system.project(mineral, views)
             if seen is not None and hard is not None:
                 first = self._refined(transmission, first, self.system.project(seen, views), hard, share)
@@ -182,7 +184,7 @@ class _Views:
         return PreparedData(lines, weights), scattered
 
     def _refined(self, transmission: Tensor, scatter: Tensor, seen: Tensor, mineral: Tensor, share: Tensor) -> Tensor:
-        """The scatter that must be in the metal's shadow for what is measured there to be what the volume shows."""
+        """Scatter refined in the metal's shadow so that the measurement agrees with the volume's projection."""
         lines, _ = transmitted_behind(seen, share, self.beam, mineral=mineral)
         spacing = self.system.geometry.pixel_spacing
         return refined_scatter(transmission, scatter, torch.exp(-lines), share.sum(0), spacing)
@@ -198,7 +200,7 @@ def _solver(
     initial: Tensor | None,
     shard: ViewShard | None,
 ) -> PWLS:
-    """Of a pass on one level or two, from a coarse volume."""
+    """Solver of one pass on one or two levels, starting from a coarse volume."""
     inputs = data.line_integrals, data.weights, config
     if not isinstance(grid, TwoLevelGrid):
         rough = VoxelRoughness(grid.spacing)
@@ -212,5 +214,5 @@ def _solver(
         roughness=TwoLevelRoughness(grid),
         shard=shard,
     )
-    solver.initial = initial  # the coarse volume, from which a resumed run prepares its data anew
+    solver.initial = initial  # the coarse volume, needed by a resumed run to prepare its data again
     return solver

@@ -1,4 +1,4 @@
-"""Registration: the objective, its optimisers and the coarse-to-fine loop."""
+"""Registration: objective, coarse-to-fine stages, result with expected errors, and view planning."""
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.optimization import OPTIMIZERS, Optimizer, Progress

@@ -13,7 +13,7 @@ SimilarityName = Literal["gradient-correlation", "gradient-difference"]
 DeformationName = Literal["auto", "ffd", "modes", "fe"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
 
-PHYSICS = ("scatter", "removed", "blur", "hardness")  # what a polyenergetic intensity model offers
+PHYSICS = ("scatter", "removed", "blur", "hardness")  # parameters of a polyenergetic intensity model
 
 _COARSEST_PIXEL_MM = 6.5  # an implant's width is more than a pixel of it
 
@@ -23,26 +23,26 @@ class Stage(Config):
 
     Attributes:
         groups: Number of control-point groups; one group is a rigid registration of the whole implant. An implant that
-            spans fewer control points has as many groups as it can.
-        modes: The groups move along this many of the implant's softest elastic modes, rigid ones included; None: each
-            group has its own six degrees of freedom.
+            spans fewer control points gets as many groups as possible.
+        modes: Number of the implant's softest elastic modes, rigid ones included, along which groups move; None: each
+            group has six degrees of freedom.
         bin: Detector pixels are averaged in squares of this side, of at most 6.5 mm.
         oversampling: DRRs are rendered on pixels this many times finer and averaged as intensities: the mean of
-            exponentials is not the exponential of the mean, and depth hangs on the difference.
+            exponentials is not the exponential of the mean, and depth is sensitive to the difference.
         pitch_factor: The implant's nodes are merged on a lattice this many times coarser.
-        similarity: "gradient-correlation", or "gradient-difference", to which the images' contrast counts too and not
-            only its shape; where DRRs are plain path lengths it is gradient correlation.
-        optimizer: Name in :data:`OPTIMIZERS`: "gauss-newton", "cmaes" or "adam".
+        similarity: "gradient-correlation", or "gradient-difference", which also compares contrast, not only shape.
+            Gradient correlation is used if DRRs are plain path lengths.
+        optimizer: Name in `OPTIMIZERS`: "gauss-newton", "cmaes" or "adam".
         iterations: At most this many iterations (generations of CMA-ES).
         tolerance: The stage ends when an iteration moves the implant by less, mm (CMA-ES: the spread of a generation).
         step_mm: Initial step: CMA-ES standard deviation, Adam learning rate, largest Gauss-Newton step.
         population: Candidates of a CMA-ES generation.
-        margin_mm: What is seen around the implant's projection, mm at the detector; None: the whole detector.
-        estimate: What is estimated beside the motion. Of the intensity model: "scatter" that comes with what passes,
-            "removed" (scatter of what is removed), "blur", "hardness", with priors about where they start. "screws":
-            lengths and radii of those that were found. "tilts": components may turn a little about their heads.
-        before: Steps before the stage's optimiser, by their names in :data:`STEPS`.
-        after: Steps after it.
+        margin_mm: Margin around the implant's projection, mm at the detector; None: the whole detector.
+        estimate: Parameters estimated besides the motion. Of the intensity model: "scatter" (from transmitted
+            intensity), "removed" (from removed intensity), "blur", "hardness", each with a prior. "screws": lengths and
+            radii of found screws. "tilts": small rotations of components about their heads. "views": motions of views.
+        before: Names of the steps before the stage's optimiser, see `BEFORE`.
+        after: Names of the steps after it, see `AFTER`.
     """
 
     groups: int = Field(1, ge=1, le=64)
@@ -63,11 +63,11 @@ class Stage(Config):
 
     @property
     def level(self) -> Level:
-        """How finely the deformation moves."""
+        """Fineness of the deformation."""
         return Level(self.groups, self.modes)
 
     def binning(self, pixel_mm: float) -> int:
-        """How many of a detector's pixels are averaged along each side."""
+        """Number of detector pixels averaged along each side."""
         return binning(self.bin, pixel_mm)
 
     @model_validator(mode="after")
@@ -78,20 +78,20 @@ class Stage(Config):
 
 
 def binning(asked: int, pixel_mm: float) -> int:
-    """How many pixels of a detector are averaged along each side: as many as asked, but none wider than an implant."""
+    """Number of detector pixels averaged along each side: as requested, but at most 6.5 mm wide."""
     return min(asked, max(1, int(_COARSEST_PIXEL_MM / pixel_mm)))
 
 
 def preset_stages(preset: PresetName, deformation: DeformationName = "modes") -> tuple[Stage, ...]:
     """Stages of a named schedule.
 
-    All begin with a rigid CMA-ES on coarse pixels, which forgives a start that is off by several mm.
+    All begin with a rigid CMA-ES on coarse pixels, which tolerates a start that is off by several mm.
 
-    * "gauss-newton": then Gauss-Newton from one group to two, and on along elastic modes.
+    * "gauss-newton": then Gauss-Newton with one group, two groups, and finally elastic modes.
     * "paper": then CMA-ES with population 40, at most 400 iterations a stage, from 2 to 10 groups (Cao et al. 2020).
     * "adam": the groups and images of "gauss-newton", with Adam.
 
-    Where the deformation is "ffd", groups move freely in all stages.
+    If the deformation is "ffd", groups move freely in all stages.
     """
     finest = {"groups": 10} if deformation == "ffd" else {"groups": 20, "modes": 40}
     start = Stage(
@@ -111,10 +111,10 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
     parts, every = ("screws", "tilts"), ("screws", "tilts", *PHYSICS)
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
     fine = {"estimate": every, **seen}
-    coarse = {"iterations": 12}  # what is left then, finer pixels tell better
+    coarse = {"iterations": 12}  # finer pixels determine the rest better
     after_others = ("background", "reweight")
     weighed = ("weigh",) if deformation in ("fe", "auto") else ()
-    hardness = ("scatter", "removed", "hardness")  # coarse pixels do not tell blur
+    hardness = ("scatter", "removed", "hardness")  # coarse pixels do not determine blur
     levels = [
         Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts, **coarse),
         Stage(bin=4, before=("find_screws", "background"), estimate=(*parts, *hardness), **seen, **coarse),
@@ -150,11 +150,11 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
 
 
 class RegistrationConfig(Config):
-    """Every option of a registration but the files; unknown keys are refused.
+    """All options of a registration except its files; unknown keys are refused.
 
     Attributes:
-        preset: Named schedule, used when ``stages`` is empty.
-        stages: The schedule itself, see :class:`Stage`.
+        preset: Named schedule, used when `stages` is empty.
+        stages: The schedule itself, see `Stage`.
         material: Name of the implant's material; None keeps plain path lengths (the paper's DRR).
         deformation: How the implant bends: "ffd" by groups of control points (the paper's model), "modes" by groups
             along the implant's softest elastic modes, "fe" as an elastic body loaded at its holes; "auto" is "fe" where
@@ -167,29 +167,30 @@ class RegistrationConfig(Config):
             over Young's modulus. That is half a squared strain: 30 charges 1e-5 of GC for strains of 1e-3, where steel
             yields, and 1e-3 for strains of 1e-2.
         load_weight: Loss for a load of 1 kN along an elastic mode, in stages of modes; it grows with the load's square.
-        hold_force_n: Force along each axis that is expected at a hole, standard deviation, N; of finite elements.
-        hold_moment_nmm: Moment about each axis there, N mm. Screws of plates whose highest stresses are a fifth to four
-            fifths of the yield stress carry 180 N and 1400 N mm, root mean square of 40 simulations (`random_case`).
-        hold_unused: How strong they are at holes without a screw against those with one, where screws are known.
-        hold_weight: Loss for a load that is a standard deviation; it grows with the load's square. None: what one of
-            the images is worth, found in stages with the step "weigh".
-        prior_weight: Loss for a parameter of the intensity model that is a standard deviation off where it most likely
-            is; it grows with the square.
+        hold_force_n: Expected force along each axis at a hole, standard deviation, N; for finite elements.
+        hold_moment_nmm: Expected moment about each axis, N mm. Screws of plates whose highest stresses are a fifth to
+            four fifths of the yield stress carry 180 N and 1400 N mm, root mean square of 40 simulations
+            (`random_case`).
+        hold_unused: Ratio of expected loads at holes without a screw to those with one, if screws are known.
+        hold_weight: Loss for a load of one standard deviation; it grows with the load's square. None: the images' loss
+            per standard deviation, estimated in stages with the step "weigh".
+        prior_weight: Loss for a parameter of the intensity model one standard deviation from its most likely value;
+            it grows with the square.
         youngs_modulus_gpa: Young's modulus of the implant, GPa. The default is that of steel; only its square times
-            ``load_weight`` counts, and the order of magnitude of that.
+            `load_weight` matters, and only in order of magnitude.
         scatter: Initial scatter, as a fraction of the measured signal about a pixel.
         scatter_mm: How widely scatter is spread, standard deviation in mm at the detector.
         blur_px: Initial standard deviation of the detector's blur, pixels.
         background_mm: Smoothness of the estimated background, standard deviation in mm at the detector.
-        background_material: What the background is made of, as far as it hardens the beam.
-        find_screws: Whether screws are looked for in the implant's holes where no components are given.
-        screw_materials: What they may be made of, besides the implant's own material.
+        background_material: Material of the background, which determines how it hardens the beam.
+        find_screws: Search for screws in the implant's holes if no components are given.
+        screw_materials: Possible materials of found screws, besides the implant's own.
         follow_radius_mm: A component follows the implant's nodes within this distance of its head.
         seed: Seed of every random number.
         backend: Projector: "auto", "cpp", "triton" or "torch".
-        view_motion: Whether views may have stood otherwise than the geometry has it: "off", "on", or "auto" where the
-            images ask for it.
-        view_motion_mm: How far, standard deviation along each axis, mm; as far by rotation.
+        view_motion: Estimate motions of the views relative to the geometry: "off", "on", or "auto" (if the images show
+            motion).
+        view_motion_mm: Expected motion of views, standard deviation along each axis, mm; the same by rotation.
         device: Where files are registered: "cpu", "cuda", "cuda:1", ...; in Python the data's own device decides.
     """
 
@@ -233,7 +234,7 @@ class RegistrationConfig(Config):
 
     @property
     def bending_prior(self) -> BendingPrior:
-        """What speaks against bending."""
+        """Penalties on bending."""
         return BendingPrior(self.beta, self.stiffness, self.load_weight, self.youngs_modulus_gpa)
 
     def schedule(self) -> tuple[Stage, ...]:

@@ -1,4 +1,4 @@
-"""What is measured of a scene at the end of its registration, and how far it may be off."""
+"""Quality measures of a registered scene, and its expected errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NODES_PITCH_MM = 2.0
 
 @torch.no_grad()
 def seen_shares(assembly: Assembly, objective: Objective) -> list[float]:
-    """Share of an implant's volume that projects on pixels that count, a view."""
+    """Share of an implant's volume that projects on valid pixels, for each view."""
     volumes, data = assembly.implant.coarsened(4).volumes, objective.images
     uv, depth = data.geometry.project(assembly.nodes(4))
     rows, cols = data.geometry.det_shape
@@ -39,22 +39,22 @@ def diagnose(
     undone: Mapping[str, str],
     rival: Rival | None,
 ) -> tuple[Diagnostics, list[Deviations]]:
-    """What is measured of a scene at the end of its registration, of several implants the worst; how each may be off.
+    """Quality measures of a registered scene (the worst of several implants) and the deviations of each implant.
 
-    Deformations that want to know how sure they are, are told.
+    Deformations that keep their covariance receive it.
 
     Args:
-        objective: Of the last stage there.
+        objective: Objective of the last stage, at the result.
         gc: Gradient correlation of each view.
-        converged: Whether the last stage ended before its iterations did.
+        converged: True if the last stage ended before its last iteration.
         undone: Number of each stage that was undone, from 1 on, and why.
-        rival: Where the implants fitted second best, if several places were tried.
+        rival: Second best place of the implants, if several were tried.
     """
     rest, scene = objective.at_rest, objective.scene
     known = objective.uncertainty(rest[0])
     deviations = deviations_of(objective, known.covariance)
     seen = [seen_shares(assembly, objective) for assembly in scene]
-    found = Diagnostics(
+    diagnostics = Diagnostics(
         gc=gc,
         misfit=1 - float(objective.similarities(rest).mean()),
         node_std_mm=max(implant.rms.whole for implant in deviations),
@@ -71,7 +71,7 @@ def diagnose(
         view_motion_mm=None if scene.view_motions is None else scene.view_motions.rms_mm,
         screws_found=sum(len(assembly.found) for assembly in scene),
     )
-    return found, deviations
+    return diagnostics, deviations
 
 
 def _folds(assembly: Assembly) -> bool:
@@ -81,10 +81,10 @@ def _folds(assembly: Assembly) -> bool:
 
 @torch.no_grad()
 def deviations_of(objective: Objective, covariance: Tensor) -> list[Deviations]:
-    """How far each implant may be off, for the covariance (D, D) of all parameters."""
-    found = []
-    for number, own in enumerate(objective.moves.keep_covariance(covariance)):
+    """Expected deviations of each implant, from the covariance (D, D) of all parameters."""
+    deviations = []
+    for number, block in enumerate(objective.moves.keep_covariance(covariance)):
         nodes = objective.scene.assemblies[number].nodes()
         depth = depth_direction(objective.images.geometry.source_positions.to(nodes), nodes.mean(0))
-        found.append(Deviations.of(*objective.moves.slopes(number), own, depth))
-    return found
+        deviations.append(Deviations.of(*objective.moves.slopes(number), block, depth))
+    return deviations

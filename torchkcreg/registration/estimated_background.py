@@ -1,4 +1,4 @@
-"""What is estimated about the images before they are compared: background and scatter."""
+"""Estimated background and scatter of the images."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _BACKGROUND_PIXELS = 4.0  # a finer background takes over the edges that a stage
 def data_with_background(
     scene: Scene, data: RegistrationData, config: RegistrationConfig, bin: int
 ) -> RegistrationData:
-    """The data with the background that goes with the scene, no finer than pixels binned so can tell."""
+    """The data with the background estimated for the scene, no finer than the binned pixels allow."""
     pixel = data.geometry.pixel_spacing[1]
     return with_background(scene, data, max(config.background_mm, _BACKGROUND_PIXELS * bin * pixel))
 
 
 def facing_data(scene: Scene, data: RegistrationData, config: RegistrationConfig) -> RegistrationData:
-    """The data whose views look at the implants, with the shapes of the scatter where the intensity model has it."""
+    """The data with the implants in front of every source, and scatter shapes if the intensity model has scatter."""
     for assembly in scene:
         data = data.facing(assembly.nodes())
     if not scene.intensity.has_background or data.scatter_shapes is not None:

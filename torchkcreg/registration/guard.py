@@ -1,4 +1,4 @@
-"""No stage may lose: what compares it with the one before, and what a state must be to be handed on."""
+"""Check after each stage that it improved the scene and left it plausible; otherwise undo it."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ _FURTHEST = 1.5  # lengths of the implant
 
 
 class Guard:
-    """The state of a scene before a stage, and whether the stage made something better of it.
+    """Keeps a scene's state before a stage and restores it if the stage made it worse.
 
     Args:
-        scene: As it is before the stages.
-        data: Projections, with the shape of the scatter.
-        config: Background.
+        scene: Scene before the first stage.
+        data: Projections, with scatter shapes.
+        config: Options of the background.
     """
 
     def __init__(self, scene: Scene, data: RegistrationData, config: RegistrationConfig) -> None:
         self.scene, self.data, self.config = scene, data, config
-        self.first_poses = [assembly.implant_to_world.clone() for assembly in scene]
+        self.first_poses = [assembly.implant_to_world.detach() for assembly in scene]
         self.bin, self.misfit = 0, math.nan
         self.kept: dict[str, Any] = {}
 
     def state_dict(self) -> dict[str, Any]:
-        """What it goes by, as tensors and plain types."""
+        """Saved state and misfit, as tensors and plain types."""
         return {"kept": self.kept, "bin": self.bin, "misfit": self.misfit}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes by that from now on."""
+        """Continue from a state of `state_dict`."""
         self.kept, self.bin, self.misfit = state["kept"], state["bin"], state["misfit"]
 
     def before(self, stage: Stage) -> None:
-        """The scene's present state is the one to go back to, and what it explains the mark."""
+        """Save the scene's present state and its misfit for comparison after the stage."""
         self.kept = self.scene.kept()
         finest = max(1, round(_PIXEL_MM / self.data.geometry.pixel_spacing[1]))
         if (bin := max(stage.bin, finest)) != self.bin:  # else it is known from the end of the stage before
             self.bin, self.misfit = bin, misfit(self.scene, self.data, self.config, bin)
 
     def after(self) -> str | None:
-        """Why the stage was undone, or None where it stands."""
+        """Undo the stage if it made the scene worse; the reason, or None if it was kept."""
         reason = implausible(self.scene, self.first_poses)
         if reason is None:
             now = misfit(self.scene, self.data, self.config, self.bin)
@@ -69,9 +69,9 @@ class Guard:
 
 @torch.no_grad()
 def misfit(scene: Scene, data: RegistrationData, config: RegistrationConfig, bin: int) -> float:
-    """What a scene leaves of the images unexplained, whatever stage it comes from: 0 is nothing.
+    """Unexplained share of the images, comparable between stages: 0 is a perfect fit.
 
-    1 - GD with the background that goes with the scene, or 1 - GC where DRRs are path lengths; all pixels alike.
+    1 - GD with the background estimated for the scene, or 1 - GC if DRRs are path lengths; all pixels weigh the same.
     """
     bin = binning(bin, data.geometry.pixel_spacing[1])
     make: type[GradientCorrelation] | type[GradientDifference] = GradientCorrelation
@@ -81,8 +81,9 @@ def misfit(scene: Scene, data: RegistrationData, config: RegistrationConfig, bin
     return 1 - float(make(view.images.line_integrals, view.images.mask)(scene(view)).mean())
 
 
+@torch.no_grad()
 def implausible(scene: Scene, starts: list[Tensor]) -> str | None:
-    """Why a scene cannot be one whose implants began at these poses (4, 4); None if it can."""
+    """Reason why the scene is implausible for implants that started at poses (4, 4); None if plausible."""
     values = [*scene.parameters(), *(a.implant_to_world for a in scene)]
     if not all(bool(torch.isfinite(value).all()) for value in values):
         return "its parameters are not finite"

@@ -1,4 +1,4 @@
-"""The deformation of an implant that a registration's options ask for."""
+"""An implant as input of a registration, and its deformation model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchkcreg.deformation import (
     bent_hold,
     spread_of_rest,
 )
-from torchkcreg.implant import Component, Hole, ImplantPointCloud
+from torchkcreg.implant import Component, Hole, ImplantPointCloud, Screw
 from torchkcreg.mechanics import Hold, LoadPrior, Superelement, holds_of
 from torchkcreg.physics import elastic_constants, is_elastic
 from torchkcreg.splines import default_grid
@@ -27,22 +27,22 @@ from .registered_implant import RegisteredImplant
 
 @dataclass(frozen=True)
 class Implant:
-    """An implant as a registration is told of it.
+    """An implant to register.
 
     Attributes:
         cloud: Undeformed implant in its own frame.
         components: Screws and the like, in the implant's frame; each follows the implant near its head.
-        holes: Its holes, see :func:`torchkcreg.implant.find_holes`: where no components are given, screws are looked
+        holes: Its holes, see `torchkcreg.implant.find_holes`: if no components are given, screws are searched
             for in them; finite elements are loaded there.
         implant_to_world: Approximate pose (4, 4); the identity when None.
         material: Name of its material; that of the options when None.
         name: How results refer to it.
-        holds: Where finite elements are loaded in place of the holes of the undeformed implant, with screws or without.
+        holds: Where finite elements are loaded, instead of at the holes of the undeformed implant.
         rest: The implant as it was registered without load: finite elements bend it from that shape.
     """
 
     cloud: ImplantPointCloud
-    components: Sequence[Component] = ()
+    components: Sequence[Component | Screw] = ()
     holes: Sequence[Hole] = ()
     implant_to_world: Tensor | None = None
     material: str | None = None
@@ -58,7 +58,7 @@ def deformation_of(implant: Implant, config: RegistrationConfig) -> Deformation:
     """The deformation that a configuration describes; "auto": finite elements where the stiffness is known.
 
     Raises:
-        ValueError: If finite elements are asked for an implant whose material is not said, or has no known stiffness;
+        ValueError: If finite elements are asked for an implant whose material is not given, or has no known stiffness;
             if another model is asked for one whose shape without load is given.
     """
     material = implant.material or config.material

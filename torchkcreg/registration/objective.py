@@ -1,4 +1,4 @@
-"""The objective of a stage: a similarity of images and what speaks against candidates but the images."""
+"""The objective of a stage: image similarity and penalties, with gradients, curvature and robust weights."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ _EDGE = 0.05  # a pixel lies on an edge of the model if its squared gradient has
 _WINDOW_PX = 2.0
 Penalty = Callable[[State], Tensor]
 SimilarityFactory = Callable[[Tensor, Tensor | None, Tensor | None], Similarity]
-_PROBES = 4  # steps that tell how much more sharp images change than coarse ones
+_PROBES = 4  # random steps that compare changes of fine and coarse images
 _NODES_AT_ONCE = 5_000_000  # of all candidates that are rendered together: 60 MB of positions
 
 
 def residual_weights(residuals: Tensor, rendered: Tensor, valid: Tensor) -> Tensor:
-    """Weights (V, rows, cols), 1 where the model fits, towards 0 where it does not.
+    """Pixel weights (V, rows, cols): 1 where the model fits, towards 0 where it does not.
 
-    ``w = 1 / (1 + e / m)`` with e the squared residual, averaged over a few pixels, and m its median over the edges of
+    `w = 1 / (1 + e / m)` with e the squared residual, averaged over a few pixels, and m its median over the edges of
     the rendered image: the weights of a Cauchy distribution for iteratively reweighted least squares (Holland & Welsch
     1977). The scale is the residual on the implant's own edges, so that a view in which the model fits badly
     everywhere keeps its weights.
 
     Args:
-        residuals: Of the unit gradients, shape (V, 2, rows, cols).
+        residuals: Residuals of the unit gradients, shape (V, 2, rows, cols).
         rendered: Gradients of the rendered images, shape (V, 2, rows, cols).
-        valid: Pixels that count, shape (V, rows, cols).
+        valid: True for valid pixels, shape (V, rows, cols).
     """
     valid = valid.to(residuals)
     energy = gaussian_blur(residuals.square().sum(1) * valid, _WINDOW_PX)
@@ -49,13 +49,13 @@ class Objective:
     """Losses, gradients and curvature of a stage, for whole batches of candidates: -GC + beta R (section 2.3).
 
     Args:
-        scene: In its present state.
-        view: What is compared, with measured images.
-        moves: What may change.
-        similarity: Makes the data term of measured images, mask and weights.
-        penalties: Further terms: functions of K candidates to (K,), beside the priors of all that may change.
-        weights: How much pixels count, shape (V, rows, cols); all alike if None.
-        coarse: The same on coarser pixels, which tell curvatures as well, at a fraction of the cost; this one if None.
+        scene: Scene in its present state.
+        view: View with measured images.
+        moves: Parameters of the stage.
+        similarity: Makes the data term from measured images, mask and weights.
+        penalties: Further terms besides the parameters' priors: functions of K candidates to (K,).
+        weights: Pixel weights, shape (V, rows, cols); uniform if None.
+        coarse: The same objective on coarser pixels, for cheaper curvatures; this objective if None.
 
     Raises:
         ValueError: If the view has no measured images.
@@ -82,11 +82,11 @@ class Objective:
 
     @property
     def at_rest(self) -> Tensor:
-        """The candidate (1, D) that leaves the scene as it is."""
+        """The candidate (1, D) that leaves the scene unchanged."""
         return self.moves.at_rest(self.device)
 
     def project(self, parameters: Tensor) -> Tensor:
-        """Candidates with all parameters inside their bounds."""
+        """Candidates with all parameters clamped to their bounds."""
         return self.moves.clamp(parameters)
 
     def line_integrals(self, parameters: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class Objective:
         return self.similarity(self.line_integrals(parameters))
 
     def penalty(self, parameters: Tensor) -> Tensor:
-        """What speaks against candidates but the images, shape (K,)."""
+        """Penalties and priors of candidates, shape (K,)."""
         return self._penalty(parameters, self.moves.state(parameters) if self.penalties else None)
 
     def _penalty(self, parameters: Tensor, state: State | None) -> Tensor:
@@ -107,7 +107,7 @@ class Objective:
 
     @torch.no_grad()
     def losses(self, candidates: Tensor) -> Tensor:
-        """One less the mean similarity, and the penalties, of candidates (K, D), shape (K,)."""
+        """1 minus the mean similarity, plus penalties, of candidates (K, D), shape (K,)."""
         return torch.cat([self._losses(c) for c in candidates.split(self._batch())])
 
     def _losses(self, candidates: Tensor) -> Tensor:
@@ -123,7 +123,7 @@ class Objective:
         return float(loss.detach()), gradient
 
     def curvature(self, parameters: Tensor, step_mm: float = 0.01) -> Tensor:
-        """Gauss-Newton second derivatives (D, D): residual images differ by forward differences, penalties exactly."""
+        """Gauss-Newton Hessian (D, D): residual images by forward differences, penalties exactly."""
         if self.coarse is None:
             return self.curvature_from(self.jacobian(parameters, step_mm)[0], parameters)
         jacobian, _ = self.coarse.jacobian(parameters, step_mm)
@@ -131,9 +131,9 @@ class Objective:
 
     @torch.no_grad()
     def _sharper(self, coarse: Tensor, parameters: Tensor, step_mm: float) -> float:
-        """How much more these images change than coarse ones, whose derivatives (D, ...) are given: along some steps.
+        """Ratio of changes of these images to those of coarse ones, whose derivatives (D, ...) are given.
 
-        Each step changes all parameters, one as much as another.
+        It is taken along random steps in which all parameters have equal effect.
         """
         signs = torch.randint(0, 2, (_PROBES, self.num_parameters), generator=torch.Generator().manual_seed(0)) * 2 - 1
         flat = coarse.flatten(1).double()
@@ -145,41 +145,43 @@ class Objective:
         return float(fine.norm()) / shown if shown > 0 else 1.0
 
     def curvature_from(self, jacobian: Tensor, parameters: Tensor) -> Tensor:
-        """Second derivatives (D, D) where the derivatives of the residuals are known."""
+        """Gauss-Newton Hessian (D, D) from given derivatives of the residuals."""
         flat = jacobian.flatten(1)
         penalty = torch.autograd.functional.hessian(lambda p: self.penalty(p[None])[0], parameters, vectorize=True)
         return 0.5 / self.images.num_views * (flat @ flat.T).double() + penalty
 
     @torch.no_grad()
     def jacobian(self, parameters: Tensor, step_mm: float = 0.01) -> tuple[Tensor, Tensor]:
-        """Derivatives (D, V, 2, rows, cols) of the residual images, and those (V, 2, rows, cols)."""
+        """Derivatives (D, V, 2, rows, cols) of the residual images, and the residual images (V, 2, rows, cols)."""
         offsets = step_mm * torch.eye(self.num_parameters, dtype=parameters.dtype, device=parameters.device)
         center = self._residuals(parameters[None])
-        own = self.moves.places.get("views")
-        if own is None:
+        view_parameters = self.moves.places.get("views")
+        if view_parameters is None:
             return self._slopes(parameters, offsets, center, step_mm), center[0]
-        # a view's motion moves its own image alone: those of all views are tried at once
+        # a view's motion changes only its own image, so all views are stepped at once
         views = self.images.num_views
-        together = offsets[own].unflatten(0, (views, -1)).sum(0)
-        found = center.new_zeros(self.num_parameters, *center.shape[1:])
-        found[: own.start] = self._slopes(parameters, offsets[: own.start], center, step_mm)
-        found[own.stop :] = self._slopes(parameters, offsets[own.stop :], center, step_mm)
+        together = offsets[view_parameters].unflatten(0, (views, -1)).sum(0)
+        derivatives = center.new_zeros(self.num_parameters, *center.shape[1:])
+        derivatives[: view_parameters.start] = self._slopes(
+            parameters, offsets[: view_parameters.start], center, step_mm
+        )
+        derivatives[view_parameters.stop :] = self._slopes(parameters, offsets[view_parameters.stop :], center, step_mm)
         of_views = self._slopes(parameters, together, center, step_mm)
-        for view, block in enumerate(found[own].unflatten(0, (views, -1))):
+        for view, block in enumerate(derivatives[view_parameters].unflatten(0, (views, -1))):
             block[:, view] = of_views[:, view]
-        return found, center[0]
+        return derivatives, center[0]
 
     def _slopes(self, parameters: Tensor, offsets: Tensor, center: Tensor, step_mm: float) -> Tensor:
-        """How the residual images (1, V, ...) change with offsets (K, D), for each of their units: (K, V, ...)."""
+        """Difference quotients (K, V, ...) of the residual images (1, V, ...) for offsets (K, D)."""
         batches = offsets.split(self._batch()) if len(offsets) else ()
         return torch.cat([center[:0], *((self._residuals(parameters + o) - center) / step_mm for o in batches)])
 
     def uncertainty(self, parameters: Tensor) -> Uncertainty:
-        """How sure the images are of parameters (D,) near the optimum."""
+        """Uncertainty of parameters (D,) near the optimum."""
         return self.uncertainty_from(*self.jacobian(parameters), parameters)
 
     def uncertainty_from(self, jacobian: Tensor, residuals: Tensor, parameters: Tensor) -> Uncertainty:
-        """How sure the images are where the derivatives of the residuals are known, see :meth:`jacobian`."""
+        """Uncertainty from given derivatives of the residuals, see `jacobian`."""
         pixel = self.view.geometry.pixel_spacing[1]
         first = self.scene.assemblies[0].nodes()
         return Uncertainty.of(
@@ -201,7 +203,7 @@ class Objective:
 
     @torch.no_grad()
     def reweighted(self) -> Objective:
-        """The objective in which pixels count by how well the scene explains them, see `residual_weights`."""
+        """The objective with pixels weighted by how well the scene explains them, see `residual_weights`."""
         images = self.line_integrals(self.at_rest)
         residuals = self.similarity.residuals(images)[0]
         weights = residual_weights(residuals, sobel_gradient(images)[0], self.images.mask)
@@ -211,5 +213,5 @@ class Objective:
         )
 
     def accept(self, parameters: Tensor) -> None:
-        """Moves the scene to parameters (D,)."""
+        """Move the scene to parameters (D,)."""
         self.moves.accept(parameters)

@@ -27,10 +27,10 @@ _SETS_AT_ONCE = 1000
 
 @dataclass(frozen=True)
 class PlannedSet:
-    """A set of views and what is expected of it.
+    """A set of views and its expected error.
 
     Attributes:
-        views: Their numbers.
+        views: Numbers of the views.
         node_std_mm: Expected error of the implant's nodes (RMS).
     """
 
@@ -40,14 +40,14 @@ class PlannedSet:
 
 @dataclass(frozen=True, eq=False)
 class ViewInformation:
-    """What each view of a scan would tell of a scene, as it is now.
+    """Information that each view of a scan would give about a scene in its present state.
 
     Attributes:
         views: Numbers of the V views.
-        curvature: Of one less each view's similarity, (V, D, D).
-        penalties: Curvature of what speaks against parameters but images, (D, D).
+        curvature: Curvature of 1 minus each view's similarity, (V, D, D).
+        penalties: Curvature of penalties and priors, (D, D).
         nodes: Mean square displacement of the nodes as a quadratic form of the parameters, (D, D), mm^2.
-        alike: How much each pair of views looks from one side, (V, V).
+        alike: Similarity of direction of each pair of views, (V, V).
     """
 
     views: tuple[int, ...]
@@ -60,33 +60,33 @@ class ViewInformation:
     def expected(self, sets: Tensor) -> Tensor:
         """Expected errors (S,) of the nodes, mm, for sets (S, n) of places among the views.
 
-        The sandwich of :attr:`Uncertainty.covariance`, each view's blocks of pixels disagreeing as much as they mostly
-        do.
+        The sandwich of `Uncertainty.covariance`, with a typical disagreement between a view's
+        pixel blocks.
         """
-        found = []
-        for some in sets.split(_SETS_AT_ONCE):
-            number = some.shape[1]
-            images = self.curvature[some].mean(1)
-            shared = self.alike[some[:, :, None], some[:, None, :]].sum((1, 2)) / number
+        errors = []
+        for batch in sets.split(_SETS_AT_ONCE):
+            number = batch.shape[1]
+            images = self.curvature[batch].mean(1)
+            shared = self.alike[batch[:, :, None], batch[:, None, :]].sum((1, 2)) / number
             whole = images + self.penalties
             size = whole.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
             bread = torch.linalg.inv(
                 whole + 1e-9 * size * torch.eye(len(self.nodes), dtype=whole.dtype, device=whole.device)
             )
             meat = 2 * _LOSS / number * shared[:, None, None] * images
-            found.append(torch.einsum("sde,sef,sfd->s", bread, meat, bread @ self.nodes).clamp_min(0).sqrt())
-        return torch.cat(found)
+            errors.append(torch.einsum("sde,sef,sfd->s", bread, meat, bread @ self.nodes).clamp_min(0).sqrt())
+        return torch.cat(errors)
 
     def best(self, number: int, *, among: Sequence[int] | None = None, kept: int = 10) -> list[PlannedSet]:
-        """The best sets of so many views, best first.
+        """The best sets of `number` views, best first.
 
-        All sets of as many evenly spaced views as can be gone through; the best of them then changes one view after the
-        other for any that is better, and is the first.
+        All sets among evenly spaced views are ranked, of as many views as is affordable. The best set is then
+        improved by exchanging single views and comes first.
 
         Args:
-            number: Of views in a set.
+            number: Number of views in a set.
             among: Numbers of the views that may be taken; all when None.
-            kept: How many sets are told.
+            kept: Number of sets returned.
         """
         allowed = [i for i, view in enumerate(self.views) if among is None or view in set(among)]
         if len(allowed) < number:
@@ -125,25 +125,25 @@ class ViewInformation:
 def view_information(
     scene: Scene, geometry: ConeBeamGeometry, config: RegistrationConfig, views: Sequence[int] | None = None
 ) -> ViewInformation:
-    """What views of a scan would tell of a scene where it is: no image is needed.
+    """Information that views of a scan would give about a scene; no images are needed.
 
-    Images are rendered; how the last stage's residuals of each would change with all that it estimates is their
-    information. Bone is not known and does not stand in the way.
+    Images are rendered. A view's information is the curvature of its residuals in all parameters of the last stage.
+    Bone is unknown and not modelled.
 
     Args:
         scene: The implant and its screws about where they will be.
         geometry: All views that could be taken.
-        config: Of the registration that is planned.
-        views: Numbers of the views that are looked at; all when None.
+        config: Options of the planned registration.
+        views: Numbers of the views to consider; all when None.
     """
     numbers = list(range(geometry.num_views)) if views is None else list(views)
     stage = config.schedule()[-1]
     stage = stage.model_copy(update={"bin": _BIN, "before": (), "after": ()})
     curvature, objective = [], None
     for start in range(0, len(numbers), _AT_ONCE):
-        some = geometry.select(numbers[start : start + _AT_ONCE])
-        lines = scene(some)
-        data = RegistrationData(some, lines, torch.ones_like(lines, dtype=torch.bool))
+        batch = geometry.select(numbers[start : start + _AT_ONCE])
+        lines = scene(batch)
+        data = RegistrationData(batch, lines, torch.ones_like(lines, dtype=torch.bool))
         run = StageRun(scene, facing_data(scene, data, config), stage, config)
         objective = run.objective
         jacobian, _ = objective.jacobian(objective.at_rest[0])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.callbacks import Callback
-from torchkcreg.implant import Component, Hole, ImplantPointCloud
+from torchkcreg.implant import Component, Hole, ImplantPointCloud, Screw
 from torchkcreg.optimization import OptimizerFactory
 from torchkcreg.physics import (
     IdentityIntensity,
@@ -33,7 +33,7 @@ def build_scene(
     config: RegistrationConfig,
     *,
     spectrum: Spectrum | None = None,
-    components: Sequence[Component] = (),
+    components: Sequence[Component | Screw] = (),
     implant_to_world: Tensor | None = None,
     holes: Sequence[Hole] = (),
     deformation: DeformationFactory = deformation_of,
@@ -42,18 +42,18 @@ def build_scene(
     """The scene of a registration at its start.
 
     Args:
-        implants: Undeformed implant in its own frame; or several, each with what is fixed to it.
-        config: Options; with ``material`` the DRR is polyenergetic, without it a plain path length.
+        implants: Undeformed implant in its own frame; or several, each an `Implant` with its components.
+        config: Options; with `material` the DRR is polyenergetic, without it a plain path length.
         spectrum: Detected spectrum; a 90 kV tungsten spectrum when None.
-        components: Of the one implant, see :class:`Implant`.
-        implant_to_world: Of the one implant.
-        holes: Of the one implant.
-        deformation: Makes the deformation of ``(implant, config)``.
-        intensity: Model in place of the one that the options describe; its path lengths are those of the implants'
+        components: Components of a single implant, see `Implant`.
+        implant_to_world: Pose (4, 4) of a single implant.
+        holes: Holes of a single implant.
+        deformation: Makes the deformation of `(implant, config)`.
+        intensity: Model in place of the options' model; its path lengths are those of the implants'
             materials, in their order, then of screws' materials, then of components' materials.
 
     Raises:
-        ValueError: If several implants come with components, a pose or holes of one.
+        ValueError: If several implants are given together with components, a pose or holes.
     """
     if isinstance(implants, ImplantPointCloud):
         implants = Implant(implants, components, holes, implant_to_world)
@@ -63,16 +63,16 @@ def build_scene(
     default = config.material or "implant"
     assemblies = [
         Assembly(
-            one.cloud,
-            deformation(one, config),
-            implant_to_world=one.implant_to_world,
-            material=one.material or default,
-            components=one.components,
-            holes=one.holes if config.find_screws and not one.components else (),
+            implant.cloud,
+            deformation(implant, config),
+            implant_to_world=implant.implant_to_world,
+            material=implant.material or default,
+            components=implant.components,
+            holes=implant.holes if config.find_screws and not implant.components else (),
             follow_radius_mm=config.follow_radius_mm,
-            name=one.name,
+            name=implant.name,
         )
-        for one in several
+        for implant in several
     ]
     looks = any(assembly.holes for assembly in assemblies) and config.material is not None
     scene = Scene(assemblies, metals=config.screw_materials if looks else (), backend=config.backend)
@@ -99,7 +99,7 @@ def register(
     config: RegistrationConfig | None = None,
     *,
     spectrum: Spectrum | None = None,
-    components: Sequence[Component] = (),
+    components: Sequence[Component | Screw] = (),
     implant_to_world: Tensor | None = None,
     holes: Sequence[Hole] = (),
     deformation: DeformationFactory = deformation_of,
@@ -115,22 +115,22 @@ def register(
     """The deformation of an implant, measured in a few projections (FFD-KC-Reg, Cao et al. 2020).
 
     Args:
-        implants: Undeformed implant in its own frame; or several, each with what is fixed to it.
+        implants: Undeformed implant in its own frame; or several, each an `Implant` with its components.
         data: Projections, masks and geometry.
         config: Options; the defaults when None.
         spectrum: Detected spectrum; a 90 kV tungsten spectrum when None.
-        components: Of the one implant, see :class:`Implant`.
-        implant_to_world: Approximate pose (4, 4) of the one implant; the identity when None.
-        holes: Of the one implant.
-        deformation: Makes the deformation of ``(implant, config)``: the one that the options name, or your own model.
-        intensity: Model in place of the one that the options describe, see :func:`build_scene`.
-        similarity: Makes the data term of ``(fixed, mask, weights)``, in place of the stages' own.
-        penalties: Functions of the K candidates of a :class:`torchkcreg.scene.State` to (K,), beside the priors.
-        optimizer: Makes the optimiser of ``(problem, stage, seed)``, in place of the stages' own.
-        steps: Steps of your own, by the names that stages call them by.
-        start: A registration of the same implants from whose poses and parameters this one starts.
-        callbacks: See :class:`torchkcreg.registration.Callback`.
-        seconds: After so long it ends with the iteration it is at; the result says so.
+        components: Components of a single implant, see `Implant`.
+        implant_to_world: Approximate pose (4, 4) of a single implant; the identity when None.
+        holes: Holes of a single implant.
+        deformation: Makes the deformation of `(implant, config)`: by default as the options say.
+        intensity: Model in place of the options' model, see `build_scene`.
+        similarity: Makes the data term of `(fixed, mask, weights)`, in place of the stages'.
+        penalties: Functions of the K candidates of a `torchkcreg.scene.State` to (K,), beside the priors.
+        optimizer: Makes the optimiser of `(problem, stage, seed)`, in place of the stages'.
+        steps: Additional steps, by the names used in stages.
+        start: Earlier registration of the same implants, whose poses and intensity parameters are the start.
+        callbacks: See `torchkcreg.registration.Callback`.
+        seconds: Time limit; after it the registration ends with the current iteration and the result says so.
 
     Raises:
         ValueError: If the pieces do not fit together.
@@ -154,9 +154,9 @@ def register(
 
 @torch.no_grad()
 def _start_from(scene: Scene, start: RegistrationResult) -> None:
-    """Poses and parameters of the intensity model of an earlier result; the implants start undeformed."""
+    """Set poses and intensity parameters from an earlier result; the implants start undeformed."""
     for assembly in scene:
-        assembly.implant_to_world.copy_(start.implant(assembly.name).implant_to_world)
+        assembly.implant_to_world = start.implant(assembly.name).implant_to_world
     for name, value in scene.intensity.named_parameters():
         if name in start.intensity:
             value.fill_(start.intensity[name])

@@ -1,4 +1,4 @@
-"""One implant as a registration left it."""
+"""One registered implant: pose, bending, screws and expected errors."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ _NODES_PITCH_MM = 1.0
 
 @dataclass
 class RegisteredImplant:
-    """One implant of a registration: ``T(x) = implant_to_world (x + u(x))`` (eq. 1 of Cao et al. 2020).
+    """One implant of a registration: `T(x) = implant_to_world (x + u(x))` (eq. 1 of Cao et al. 2020).
 
     Attributes:
         name: Its name in the scene.
         implant_to_world: Global rigid transform, shape (4, 4), float64.
         deformation: Displacements u in the implant's frame.
-        material: Name of its material; None where the registration had none.
+        material: Name of its material; None if the registration had none.
         components: Rigid motion (4, 4) of each component in the implant's frame.
-        screws: Those of the components that are screws, in the implant's frame before the motion.
+        screws: The components that are screws, in the implant's frame before the motion.
         found: Names of the screws that were found, not given.
-        follow_radius_mm: How near to a component's head the implant's nodes tell its motion, mm.
-        cloud: The undeformed implant's nodes; None where the result was read from a run folder.
-        deviations: How far it may be off; None where nobody knows.
+        follow_radius_mm: A component follows the implant's nodes within this distance of its head, mm.
+        cloud: The undeformed implant's nodes; None if the result was read from a run folder.
+        deviations: Expected deviations; None if unknown.
     """
 
     name: str
@@ -52,10 +52,10 @@ class RegisteredImplant:
     def of(
         cls, assembly: Assembly, *, has_material: bool = True, deviations: Deviations | None = None
     ) -> RegisteredImplant:
-        """An assembly as it is now."""
+        """The registered implant of an assembly's present state."""
         return cls(
             name=assembly.name,
-            implant_to_world=assembly.implant_to_world.clone(),
+            implant_to_world=assembly.implant_to_world.detach(),
             deformation=assembly.deformation,
             material=assembly.material if has_material else None,
             components=assembly.component_motions(),
@@ -90,7 +90,7 @@ class RegisteredImplant:
         return transform_points(self.implant_to_world, flat + self.displacement(flat)).reshape(points.shape)
 
     def outside(self, points: Tensor) -> Tensor:
-        """True for points (..., 3) where the deformation only goes on from elsewhere."""
+        """True for points (..., 3) outside the deformation's valid domain, where it is extrapolated."""
         return self.deformation.outside(points.to(self.implant_to_world))
 
     def deformed(self, mesh: trimesh.Trimesh, *, longest_edge_mm: float = 4.0) -> trimesh.Trimesh:
@@ -101,8 +101,8 @@ class RegisteredImplant:
         """Rigid motion (4, 4) from the implant's frame to the world of a screw: as registered, or following its head.
 
         Args:
-            screw: One of the registration's, by its name, or any other.
-            nodes: Nodes (N, 3) of the undeformed implant, where the result has none.
+            screw: A screw of the registration, matched by name, or any other.
+            nodes: Nodes (N, 3) of the undeformed implant, if the result has none.
 
         Raises:
             ValueError: If there are no nodes that a screw which was not registered could follow.
@@ -110,11 +110,11 @@ class RegisteredImplant:
         known = self.components.get(screw.name)
         if known is not None:
             return self.implant_to_world @ known.to(self.implant_to_world)
-        own = self.cloud.points if nodes is None and self.cloud is not None else nodes
-        if own is None:
+        points = self.cloud.points if nodes is None and self.cloud is not None else nodes
+        if points is None:
             raise ValueError(f"screw {screw.name} was not registered, and there are no nodes of the implant to follow")
         head = self.implant_to_world.new_tensor(screw.start)
-        return followed_motion(own, head, self.follow_radius_mm, self.warp)
+        return followed_motion(points, head, self.follow_radius_mm, self.warp)
 
     def known_components(
         self,
@@ -124,16 +124,16 @@ class RegisteredImplant:
         material: str | None = None,
         pitch: float = 0.25,
     ) -> list[KnownComponent]:
-        """The bent implant, then its screws, as metal in its place in the world: what KC-Rec takes.
+        """The bent implant, then its screws, as known components in the world, for KC-Rec.
 
         Args:
             mesh: The undeformed implant, which makes its mask exact; without it, the registered nodes are taken.
-            screws: In place of the registration's; each that it did not have follows the implant near its head.
-            material: Of the implant, where the registration had none.
-            pitch: Of the nodes made of meshes, mm.
+            screws: Screws to use instead of the registration's; each unknown one follows the implant near its head.
+            material: Material of the implant, if the registration had none.
+            pitch: Pitch of the nodes made from meshes, mm.
 
         Raises:
-            ValueError: If nothing says what the implant is made of, or there is neither mesh nor node.
+            ValueError: If the implant's material is unknown, or there are neither mesh nor nodes.
         """
         name = material or self.material
         if name is None:
@@ -179,7 +179,7 @@ class RegisteredImplant:
 
     @classmethod
     def from_dict(cls, content: Any) -> RegisteredImplant:
-        """What :meth:`to_dict` gave, in float64.
+        """The implant that `to_dict` wrote, in float64.
 
         Raises:
             ValueError: If a key is missing or malformed; the message names it.

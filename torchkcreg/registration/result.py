@@ -28,21 +28,21 @@ FORMAT_VERSION = 2
 
 
 def upgraded(content: dict[str, Any]) -> dict[str, Any]:
-    """Plain data of format version 1, which knew one implant and other stages, as version 2.
+    """Convert plain data of format version 1 (one implant, other stages) to version 2.
 
     Raises:
         ValueError: If a key is missing.
     """
     of_implant = ("implant_to_world", "components", "grid", "control_points_mm", "labels", "screws_found")
     require_keys(content, ("implant_to_world", "grid", "control_points_mm", "labels", "gc", "config"))
-    found = [{**screw, "name": f"found{i}"} for i, screw in enumerate(content.get("screws_found", []))]
+    screws = [{**screw, "name": f"found{i}"} for i, screw in enumerate(content.get("screws_found", []))]
     implant = {
         "implant_to_world": content["implant_to_world"],
         "material": content["config"].get("material"),
         "deformation": {"model": "ffd", **{key: content[key] for key in ("grid", "control_points_mm", "labels")}},
         "components": content.get("components", {}),
-        "screws": found,
-        "found": [screw["name"] for screw in found],
+        "screws": screws,
+        "found": [screw["name"] for screw in screws],
     }
     options = {key: value for key, value in content["config"].items() if key != "stages"}
     rest = {key: value for key, value in content.items() if key not in of_implant}
@@ -50,20 +50,20 @@ def upgraded(content: dict[str, Any]) -> dict[str, Any]:
 
 
 class RegisteredImplants:
-    """What can be asked of registered implants; :class:`RegistrationResult` holds them."""
+    """Methods of a set of registered implants; `RegistrationResult` holds them."""
 
     implants: list[RegisteredImplant]
 
     def implant(self, name: str | None = None) -> RegisteredImplant:
-        """The implant of a name; the first one without.
+        """The implant of this name; the first one if None.
 
         Raises:
             KeyError: If there is none of that name.
         """
-        found = [i for i in self.implants if name in (None, i.name)]
-        if not found:
+        matching = [i for i in self.implants if name in (None, i.name)]
+        if not matching:
             raise KeyError(f"no implant {name!r}: there are {', '.join(i.name for i in self.implants)}")
-        return found[0]
+        return matching[0]
 
     @property
     def implant_to_world(self) -> Tensor:
@@ -83,7 +83,7 @@ class RegisteredImplants:
     def warp(self, points: Tensor, *, implant: str | None = None) -> Tensor:
         """World positions (..., 3), mm, of points (..., 3) of the undeformed implant's frame, in float64.
 
-        Points beyond the control-point grid move rigidly with the nearest group; :meth:`outside` flags them.
+        Points beyond the control-point grid move rigidly with the nearest group; `outside` flags them.
         """
         return self.implant(implant).warp(points)
 
@@ -104,14 +104,15 @@ class RegisteredImplants:
     def known_components(
         self, meshes: trimesh.Trimesh | Mapping[str, trimesh.Trimesh] | None = None, *, pitch: float = 0.25
     ) -> list[KnownComponent]:
-        """The bent implants and their screws as metal in its place: what KC-Rec takes.
+        """The bent implants and their screws as known components in the world, for KC-Rec.
 
         Args:
-            meshes: Undeformed implant, or one a name; they make masks exact. Without, registered nodes are taken.
-            pitch: Of the nodes made of meshes, mm.
+            meshes: Mesh of the undeformed implant, or one per name; makes masks exact. If None, registered nodes are
+                used.
+            pitch: Pitch of the nodes made from meshes, mm.
 
         Raises:
-            ValueError: If nothing says what an implant is made of, or there is neither mesh nor node.
+            ValueError: If an implant's material is unknown, or there are neither mesh nor nodes.
         """
         named = {self.implants[0].name: meshes} if isinstance(meshes, trimesh.Trimesh) else dict(meshes or {})
         return [part for i in self.implants for part in i.known_components(named.get(i.name), pitch=pitch)]
@@ -119,24 +120,24 @@ class RegisteredImplants:
 
 @dataclass
 class RegistrationResult(RegisteredImplants):
-    """What a registration found.
+    """Result of a registration.
 
     Attributes:
-        implants: Each of the registered implants; the first one is what `warp` and its like mean without a name.
+        implants: The registered implants; `warp` and similar methods use the first one if no name is given.
         gc: Gradient correlation of each view at the end, shape (V,).
         history: One record an iteration: stage, iteration, loss, step_mm, seconds.
-        config: Options that made the result.
+        config: Options of the registration.
         seed: Seed of the random numbers.
-        status: "ok", "doubtful" or "failed": whether the result can be trusted, for the reasons in ``warnings``.
-        warnings: What a user should know before trusting the numbers.
-        diagnostics: What the verdict rests on, see ``Diagnostics``; ``node_std_mm`` is the expected root mean square
+        status: "ok", "doubtful" or "failed": whether the result can be trusted, for the reasons in `warnings`.
+        warnings: Reasons for caution, in words.
+        diagnostics: Measures behind the verdict, see `Diagnostics`; `node_std_mm` is the expected root mean square
             error of the implant's nodes.
         stages: One record a stage: iterations, converged, loss, undone.
         intensity: Estimated parameters of the intensity model.
-        blur_mm: Standard deviation of the system's blur on the detector, as it was found; 0 where none was modelled.
-        view_motions: Rigid motions (V, 4, 4) of the world before it was projected in each view, ``P_v T_v``, where they
-            were found to be other than the geometry has it; None where the geometry is as it was told.
-        scene: The scene as it was registered; None for one that was read from a run folder.
+        blur_mm: Standard deviation of the system's blur on the detector; 0 if not modelled.
+        view_motions: Estimated rigid motions (V, 4, 4) of the world before projection in each view, `P_v T_v`; None
+            if the geometry was kept.
+        scene: The registered scene; None if the result was read from a run folder.
     """
 
     implants: list[RegisteredImplant]
@@ -154,7 +155,7 @@ class RegistrationResult(RegisteredImplants):
     scene: Scene | None = field(default=None, repr=False)
 
     def corrected(self, geometry: ConeBeamGeometry) -> ConeBeamGeometry:
-        """The geometry of the registered views as they were found to be; what was told where it held."""
+        """The geometry corrected by the estimated view motions; unchanged if there are none."""
         return geometry if self.view_motions is None else geometry.moved(self.view_motions)
 
     @torch.no_grad()
@@ -167,7 +168,7 @@ class RegistrationResult(RegisteredImplants):
         return self._scene()(geometry)
 
     def beam(self) -> Beam:
-        """The beam that the registration found, as hard as it found it, with the attenuation of the known components.
+        """Beam with the estimated hardness and the attenuation of the known components.
 
         Raises:
             ValueError: If DRRs were plain path lengths, or the result has no scene.
@@ -181,7 +182,7 @@ class RegistrationResult(RegisteredImplants):
 
     @torch.no_grad()
     def scatter(self, transmission: Tensor, geometry: ConeBeamGeometry, *, mask: Tensor | None = None) -> Tensor:
-        """Scatter (V, rows, cols) in units of the open beam, as the registration found it, of any views of the scan.
+        """Estimated scatter (V, rows, cols) in any views of the scan, in units of the open beam.
 
         Args:
             transmission: Measured intensity over the open beam's, shape (V, rows, cols).
@@ -200,19 +201,19 @@ class RegistrationResult(RegisteredImplants):
         *,
         mask: Tensor | None = None,
     ) -> dict[str, Any]:
-        """What a reconstruction of the whole scan takes from the registration, as arguments of its `reconstruct`.
+        """Arguments of `reconstruct` that a reconstruction of the whole scan takes from the registration.
 
-        Beam, components in their place, scatter and blur, all as the registration found them:
-        ``reconstruct(transmission, geometry, grid, **result.known(transmission, geometry, mesh))``.
+        Estimated beam, components, scatter and blur:
+        `reconstruct(transmission, geometry, grid, **result.known(transmission, geometry, mesh))`.
 
         Args:
             transmission: Measured intensity over the open beam's, shape (V, rows, cols), of all views.
             geometry: The views.
-            meshes: See :meth:`known_components`.
+            meshes: See `known_components`.
             mask: 0 where a pixel holds no measurement.
 
         Raises:
-            ValueError: As :meth:`beam` and :meth:`known_components` do.
+            ValueError: As `beam` and `known_components` do.
         """
         return {
             "beam": self.beam(),
@@ -236,7 +237,7 @@ class RegistrationResult(RegisteredImplants):
         return self.scene
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the result with its scene, for :meth:`load`.
+        """Write the result with its scene, for `load`.
 
         Raises:
             ValueError: If a parameter is not finite, or the result has no scene.
@@ -248,11 +249,11 @@ class RegistrationResult(RegisteredImplants):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> RegistrationResult:
-        """What :meth:`save` wrote; nothing in the file is executed.
+        """Read a file that `save` wrote; no code in the file is executed.
 
         Raises:
-            ValueError: If the file is none, or damaged.
-            FileNotFoundError: If there is none.
+            ValueError: If it is not such a file, or damaged.
+            FileNotFoundError: If there is no file.
         """
         try:
             content = torch.load(path, map_location="cpu", weights_only=True)
@@ -269,7 +270,7 @@ class RegistrationResult(RegisteredImplants):
         return result
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types and tensors, all that :meth:`from_dict` needs to warp any point as the result does.
+        """Plain types and tensors, all that `from_dict` needs to warp any point as the result does.
 
         Raises:
             ValueError: If a parameter is not finite.
@@ -294,11 +295,11 @@ class RegistrationResult(RegisteredImplants):
 
     @classmethod
     def from_dict(cls, content: Any, *, history: list[dict[str, Any]] | None = None) -> RegistrationResult:
-        """The result that :meth:`to_dict` described, in float64; it warps points to the same positions.
+        """The result that `to_dict` wrote, in float64; it warps points to the same positions.
 
         Args:
             content: The dict; of format version 1 or 2.
-            history: Records of the iterations, where they are at hand.
+            history: Records of the iterations, if available.
 
         Raises:
             ValueError: If a key is missing or malformed, or the format is a later one; the message names it.

@@ -1,4 +1,4 @@
-"""Screws that nobody told of: cylinders along the implant's holes, found by what they add to gradient correlation."""
+"""Search for unknown screws: cylinders along the implant's holes that raise gradient correlation."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _LEAST_SHARE = 0.01  # of the loss without screws that one more must take away
 
 @torch.no_grad()
 def find_screws(scene: Scene, assembly: Assembly, data: RegistrationData, *, bin: int = 4) -> list[Screw]:
-    """Screws of the metal that explains the images best, see :func:`screws_by_metal`."""
+    """Find screws of the metal that explains the images best, see `screws_by_metal`."""
     return of_best_metal(screws_by_metal(scene, assembly, data, bin=bin))
 
 
 def of_best_metal(found: Sequence[tuple[list[Screw], float]]) -> list[Screw]:
-    """The screws of least loss; the first ones, of the implant's own metal, have an advantage."""
+    """The screws of least loss, favouring the first set, which is of the implant's metal."""
     losses = [loss * (1.0 if number else _OTHER_METAL) for number, (_, loss) in enumerate(found)]
     return found[losses.index(min(losses))][0]
 
@@ -37,7 +37,7 @@ def of_best_metal(found: Sequence[tuple[list[Screw], float]]) -> list[Screw]:
 def screws_by_metal(
     scene: Scene, assembly: Assembly, data: RegistrationData, *, bin: int = 4
 ) -> list[tuple[list[Screw], float]]:
-    """Screws in some of an implant's holes, and the loss with them, for each metal; the implant's own comes first.
+    """Screws in an implant's holes and the loss with them, for each metal; the implant's metal comes first.
 
     Starting from none, the hole and side whose screw raises gradient correlation most gets one, until the next would
     take away less than a hundredth of the loss. Then they are refined. They are tried along their holes, as locking
@@ -46,8 +46,7 @@ def screws_by_metal(
 
     Args:
         scene: Implants near their poses.
-        assembly: The one of them in whose holes screws are looked for, with those found so far; other components of it
-            are ignored.
+        assembly: Implant whose holes are searched, with the screws found so far; its other components are ignored.
         data: Projections.
         bin: Detector pixels are averaged in squares of this side.
     """
@@ -57,7 +56,7 @@ def screws_by_metal(
 
 
 class _Search:
-    """Losses of an implant with screws, whose path lengths are rendered once each."""
+    """Losses of an implant with screws; each screw's path lengths are rendered once."""
 
     def __init__(self, scene: Scene, assembly: Assembly, data: RegistrationData, bin: int) -> None:
         self.scene, self.assembly = scene, assembly
@@ -87,7 +86,7 @@ class _Search:
         return screws
 
     def losses(self, sets: Sequence[Sequence[Screw]]) -> list[float]:
-        """Of several sets of screws at once."""
+        """Losses of several sets of screws at once."""
         paths = self.bare.repeat(len(sets), *[1] * (self.bare.dim() - 1))
         for path, screws in zip(paths, sets, strict=True):
             for screw in screws:
@@ -96,7 +95,7 @@ class _Search:
         return (1.0 - self.similarity(lines).mean(-1)).tolist()
 
     def moved(self, screws: list[Screw], index: int) -> list[Screw]:
-        """A screw where it is and with its head in the other parts of a combination hole, tip and direction kept."""
+        """The screw and variants with the head in other parts of a combination hole, keeping tip or direction."""
         screw = screws[index]
         others = [*screws[:index], *screws[index + 1 :]]
         near = [place for place in self.places if place.overlaps(screw) and place.same_side(screw)]
@@ -108,8 +107,8 @@ class _Search:
         without, *first = self.losses([[], *([candidate] for candidate in candidates)])
         best, gains = without, {c: without - loss for c, loss in zip(candidates, first, strict=True)}
         while gains:
-            # What a screw gains hardly grows with the others: as long as the one that gained most before still does,
-            # the rest need not be tried again.
+            # The gain of a screw hardly grows when others are added, so if the best one keeps its lead the rest need
+            # not be tried again.
             tried: dict[Screw, float] = {}
             while (top := max(gains, key=gains.__getitem__)) not in tried:
                 tried[top] = gains[top] = best - self.losses([[*chosen, top]])[0]
@@ -144,6 +143,6 @@ def _along(hole: Hole, side: float, material: str) -> Screw:
 
 
 def _shifted(screw: Screw, start: tuple[float, float, float]) -> Screw:
-    """The screw, moved as a whole until it starts there."""
+    """The screw, shifted to a new start point."""
     x, y, z = (end + there - here for end, there, here in zip(screw.end, start, screw.start, strict=True))
     return replace(screw, start=start, end=(x, y, z))

@@ -1,4 +1,4 @@
-"""A stage in the making: the scene, the data and the objective that its steps work on."""
+"""A running stage: the scene, the data and the objective that its steps work on."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .verdict import Rival
 
 @dataclass(frozen=True)
 class Terms:
-    """What a user has put in place of, or beside, what the stages say.
+    """The user's similarity, penalties and optimiser, which replace or extend the stages'.
 
     Attributes:
-        similarity: Of all stages, in place of theirs.
-        penalties: Beside the priors.
-        optimizer: Of all stages, in place of theirs.
+        similarity: Replaces that of all stages.
+        penalties: Penalties besides the priors.
+        optimizer: Replaces that of all stages.
     """
 
     similarity: SimilarityFactory | None = None
@@ -41,22 +41,22 @@ _COARSE_BIN = 2  # an expected error needs no finer pixels
 
 @dataclass
 class StageRun:
-    """What a stage works on, and what its steps change.
+    """State of a running stage, which its steps may change.
 
     Attributes:
         scene: In its present state.
-        data: What it is compared with, at full resolution.
+        data: Measured data at full resolution.
         stage: Options of the stage.
         config: Options of the registration.
-        terms: The user's.
-        seed: Of the stage's random numbers.
+        terms: The user's terms.
+        seed: Seed of the stage's random numbers.
         remaining: Steps before the optimiser that have not been taken yet; a step may take them itself.
-        optimizer: Of the objective, once it has begun.
+        optimizer: Optimiser of the objective, once started.
         reports: Its progress so far.
-        following: The stages that will come.
-        trial: Runs stages on the scene as it is; what of the images they leave unexplained.
-        rival: Where the implants fitted second best, where several places were tried.
-        accepted: Whether the scene has moved to where the stage ended.
+        following: The stages after this one.
+        trial: Runs stages on the present scene and returns the misfit.
+        rival: Second best place of the implants, if several were tried.
+        accepted: True if the scene has been moved to the stage's result.
     """
 
     scene: Scene
@@ -76,7 +76,7 @@ class StageRun:
 
     @property
     def objective(self) -> Objective:
-        """Of the scene and the data as they are when it is first asked for; steps that change them drop it."""
+        """Objective of the scene and data at first access; steps that change them discard it."""
         if self._objective is None:
             self._objective = self._made()
         return self._objective
@@ -86,16 +86,16 @@ class StageRun:
         self._objective, self.optimizer, self.reports = objective, None, []
 
     def renew(self) -> None:
-        """Drops the objective and what was found with it: scene or data have changed."""
+        """Discard objective, optimiser and reports after scene or data have changed."""
         self._objective, self.optimizer, self.reports = None, None, []
 
     def prepare(self) -> None:
-        """Takes the steps that remain."""
+        """Run the remaining steps."""
         while self.remaining:
             self.remaining.pop(0)(self)
 
     def begin(self) -> Optimizer:
-        """The stage's optimiser, a new one if it has not begun."""
+        """The stage's optimiser, created at the first call."""
         if self.optimizer is None:
             make = self.terms.optimizer or OPTIMIZERS[self.stage.optimizer]
             self.optimizer = make(self.objective, self.stage, self.seed)
@@ -107,7 +107,7 @@ class StageRun:
         *,
         stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Runs the optimiser to its end, or until it is stopped."""
+        """Run the optimiser to its end, or until it is stopped."""
         optimizer = self.begin()
         while not optimizer.done and not stop():
             iterate(optimizer)
@@ -115,19 +115,19 @@ class StageRun:
             report(optimizer.progress)
 
     def accept(self, parameters: Tensor) -> None:
-        """Moves the scene to parameters (D,) of the objective."""
+        """Move the scene to parameters (D,) of the objective."""
         self.objective.accept(parameters)
         self.accepted = True
 
     def with_background(self) -> None:
-        """Estimates what the scene lacks, if its intensity model knows a background."""
+        """Estimate the background, if the intensity model has one."""
         if self.scene.intensity.has_background:
             bin = self.stage.binning(self.data.geometry.pixel_spacing[1])
             self.data = data_with_background(self.scene, self.data, self.config, bin)
             self.renew()
 
     def view(self, coarser: int = 1) -> View:
-        """What the stage sees; on coarser pixels, of fewer nodes, where asked."""
+        """View of the stage; with coarser pixels and fewer nodes if `coarser` > 1."""
         stage = self.stage
         return self.scene.view(
             self.data,
@@ -138,7 +138,7 @@ class StageRun:
         )
 
     def similarity(self) -> SimilarityFactory:
-        """What makes the stage's data term."""
+        """Factory of the stage's data term."""
         if self.terms.similarity is not None:
             return self.terms.similarity
         sees_contrast = self.stage.similarity == "gradient-difference" and self.scene.intensity.has_background
@@ -166,13 +166,13 @@ class StageRun:
 
 @torch.no_grad()
 def similarities(run: StageRun, make: SimilarityFactory | None = None) -> Tensor:
-    """Similarity (V,) of the scene as it is with the images that a stage compares it with."""
+    """Similarity (V,) of the present scene with the images of a stage."""
     view = run.view()
     return (make or run.similarity())(view.images.line_integrals, view.images.mask, None)(run.scene(view))
 
 
 def changed(run: StageRun, **options: object) -> StageRun:
-    """A run of the same scene and data with another stage's options."""
+    """A run of the same scene and data with changed options of the stage."""
     stage = run.stage.model_copy(update=options)
     return replace(run, stage=stage, optimizer=None, reports=[], _objective=None)
 

@@ -1,4 +1,4 @@
-"""What a stage does before and after its optimiser, as steps under names that a schedule calls them by."""
+"""Named steps that a stage runs before and after its optimiser."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _LOOKS = ("find_screws", "choose_screws")
 
 
 class ViewEvidence(NamedTuple):
-    """What motions of the views would explain of the images.
+    """Evidence in the images for motions of the views.
 
     Attributes:
-        motion_mm: How far the likeliest of them move the nodes, root mean square over the views.
-        strength: By how much the loss would fall, in losses of a deviation for each of their parameters that the images
-            determine: about one where nothing moved.
+        motion_mm: Displacement of the nodes by the likeliest motions, root mean square over the views.
+        strength: Decrease of the loss per parameter determined by the images, in units of the loss of one standard
+            deviation: about one if nothing moved.
     """
 
     motion_mm: float
@@ -42,45 +42,45 @@ class ViewEvidence(NamedTuple):
 
     @property
     def is_strong(self) -> bool:
-        """Whether the views have moved."""
+        """True if the views have moved."""
         return self.strength > _LEAST_STRENGTH
 
 
 def view_evidence(objective: Objective) -> ViewEvidence:
-    """What motions of the views would explain beside all else that is free in an objective; their prior is weighed.
+    """Evidence for motions of the views beyond all other free parameters; sets the weight of their prior.
 
-    A deviation is measured by what would be left of the residual images where the views had moved: what they are at
-    odds about now may be all that is left.
+    The loss of one standard deviation is taken from the residual images that remain after the best motion, since the
+    present residuals may be caused by the motion itself.
     """
     rest = objective.at_rest[0]
     jacobian, residuals = objective.jacobian(rest)
-    left = residuals
+    remaining = residuals
     for _ in range(_WEIGHINGS):
-        objective.moves["views"].weigh(objective.uncertainty_from(jacobian, left, rest).loss_of_a_deviation)
-        known = objective.uncertainty_from(jacobian, left, rest)  # with that weight
+        objective.moves["views"].weigh(objective.uncertainty_from(jacobian, remaining, rest).loss_of_a_deviation)
+        known = objective.uncertainty_from(jacobian, remaining, rest)  # with that weight
         slope = 0.5 / len(residuals) * (jacobian.flatten(1) @ residuals.flatten()).double()
         slope = slope + _slope(objective, rest)
         step, gain, number = _best(known.images + known.penalties, known.images, slope)
-        left = residuals + torch.einsum("d,dvkij->vkij", step.to(jacobian), jacobian)
+        remaining = residuals + torch.einsum("d,dvkij->vkij", step.to(jacobian), jacobian)
     views = objective.moves.places["views"]
     others = torch.ones_like(slope, dtype=torch.bool)
     others[views] = False
     images, whole = (m[others][:, others] for m in (known.images, known.images + known.penalties))
     _, less, fewer = _best(whole, images, slope[others])
     motion = step[views].unflatten(0, (-1, 6)).square().sum(-1).mean().sqrt()
-    told = (number - fewer).clamp_min(1.0)
-    return ViewEvidence(float(motion), float((gain - less) / (known.loss_of_a_deviation * told)))
+    determined = (number - fewer).clamp_min(1.0)
+    return ViewEvidence(float(motion), float((gain - less) / (known.loss_of_a_deviation * determined)))
 
 
 def _slope(objective: Objective, at: Tensor) -> Tensor:
-    """Gradient (D,) of what speaks against parameters (D,) but the images."""
+    """Gradient (D,) of penalties and priors at parameters (D,)."""
     leaf = at.clone().requires_grad_(True)
     (slope,) = torch.autograd.grad(objective.penalty(leaf[None])[0], leaf)
     return slope
 
 
 def _best(curvature: Tensor, images: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The step to the optimum, by how much the loss falls on it, and how many parameters the images determine."""
+    """Step to the optimum, decrease of the loss, and number of parameters determined by the images."""
     same = torch.eye(len(curvature), dtype=curvature.dtype, device=curvature.device)
     inverse = torch.linalg.inv(curvature + 1e-9 * curvature.diagonal().mean() * same)
     step = -inverse @ slope
@@ -89,14 +89,14 @@ def _best(curvature: Tensor, images: Tensor, slope: Tensor) -> tuple[Tensor, Ten
 
 @torch.no_grad()
 def places(objective: Objective, found: Tensor) -> list[Tensor]:
-    """Parameters (D,) of a rigid stage from which the registration is worth trying, that found first.
+    """Candidate parameters (D,) of a rigid stage to continue from, the stage's result first.
 
-    Others are where the loss has a minimum along an implant's long axis, up to half its length away, and the start,
-    where the stage left it by more than a few steps: coarse pixels may prefer another place without seeing the holes.
+    Others are minima of the loss along an implant's long axis, up to half its length away, and the start, if the stage
+    moved away by more than a few steps: on coarse pixels holes are invisible and a wrong place may fit better.
 
     Args:
         objective: Of a rigid stage.
-        found: Where the stage ended, shape (D,).
+        found: Result of the stage, shape (D,).
     """
     moves, others = objective.moves, []
     for number, assembly in enumerate(objective.scene):
@@ -123,17 +123,16 @@ def _distance(moves: Moves, one: Tensor, other: Tensor) -> float:
 
 
 def find(run: StageRun) -> None:
-    """Looks for screws in the holes of implants to which none were given; they are their components from now on."""
+    """Find screws in the holes of implants without given components; they become the components."""
     for assembly in _with_holes(run):
         assembly.place(find_screws(run.scene, assembly, run.data, bin=min(run.stage.bin, _SCREW_BIN)))
         run.renew()
 
 
 def choose(run: StageRun) -> None:
-    """Finds screws in every metal, runs the stage with each, and keeps what explains the images best.
+    """Find screws of every metal, run the stage with each, and keep those that explain the images best.
 
-    Coarse images without the stage's motion tell metals badly. Of several implants each chooses while the others keep
-    what they have.
+    Coarse images without the stage's motion distinguish metals poorly. Several implants choose in turn.
     """
     rest = list(run.remaining)
     for assembly in _with_holes(run):
@@ -154,17 +153,17 @@ def choose(run: StageRun) -> None:
 
 
 def estimate_background(run: StageRun) -> None:
-    """Estimates what the scene lacks (bone, water) as a smooth path length, which DRRs include."""
+    """Estimate the background (bone, water) as a smooth path length, which DRRs include."""
     run.with_background()
 
 
 def reweight(run: StageRun) -> None:
-    """Weights pixels by how well the scene explains them, see `residual_weights`."""
+    """Weight pixels by how well the scene explains them, see `residual_weights`."""
     run.objective = run.objective.reweighted()
 
 
 def weigh(run: StageRun) -> None:
-    """Tells priors without a weight of their own how much the images are worth, see `Uncertainty`."""
+    """Set the weight of priors that have no fixed weight from the image uncertainty, see `Uncertainty`."""
     objective = run.objective
     loss = objective.uncertainty(objective.at_rest[0]).loss_of_a_deviation
     for block in objective.moves.values():
@@ -172,7 +171,7 @@ def weigh(run: StageRun) -> None:
 
 
 def align(run: StageRun) -> None:
-    """Lets views move from now on, if they may and the images ask for it: that explains more than chance would."""
+    """Enable motions of the views if allowed and, for "auto", if the evidence for them is strong."""
     config, scene = run.config, run.scene
     if config.view_motion == "off" or scene.view_motions is not None or run.data.num_views < _FEWEST_VIEWS:
         return
@@ -180,8 +179,8 @@ def align(run: StageRun) -> None:
     scene.view_motions = ViewMotions(nodes, run.data.num_views, config.view_motion_mm)
     probe = coarse(run)
     probe.objective = probe.objective.reweighted()
-    found = view_evidence(probe.objective)
-    if config.view_motion == "auto" and not found.is_strong:
+    evidence = view_evidence(probe.objective)
+    if config.view_motion == "auto" and not evidence.is_strong:
         scene.view_motions = None
         return
     probe.optimize()
@@ -190,7 +189,7 @@ def align(run: StageRun) -> None:
 
 
 def slide(run: StageRun) -> None:
-    """Tries the implants all along their long axes, and stays where the rigid stages explain the images best."""
+    """Try places along the implants' long axes and keep the one at which the rigid stages fit best."""
     candidates = places(run.objective, run.begin().best())
     if len(candidates) == 1 or run.trial is None:
         return
@@ -207,7 +206,7 @@ def slide(run: StageRun) -> None:
 
 
 def rigid_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
-    """Those at the beginning that keep the implants rigid; one look for screws, in the second, and none for places."""
+    """The leading rigid stages, with a screw search only in the second and no steps after the optimiser."""
     rigid = itertools.takewhile(lambda stage: stage.level.is_rigid, stages)
     return tuple(_bare(stage, looks=number == 1) for number, stage in enumerate(rigid))
 
@@ -233,4 +232,4 @@ BEFORE: dict[str, Step] = {
     "weigh": weigh,
 }
 AFTER: dict[str, Step] = {"slide": slide}
-CHANGE_SCENE = (*_LOOKS, "align")  # of the steps before an optimiser: a checkpoint within a stage has what they did
+CHANGE_SCENE = (*_LOOKS, "align")  # steps not repeated when resuming within a stage: the checkpoint has their effect

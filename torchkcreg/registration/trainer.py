@@ -43,10 +43,10 @@ def finished(
     rival: Rival | None,
     stopped: str | None,
 ) -> RegistrationResult:
-    """The result of a registration whose scene is at its end."""
+    """The result of a registration from its final scene."""
     run = StageRun(scene, data, last, config, terms=terms)
     run.with_background()
-    gc = similarities(run, GradientCorrelation)  # in which every pixel counts alike
+    gc = similarities(run, GradientCorrelation)  # with uniform pixel weights
     probe = _diagnosed(run, data)
     converged = _converged(history, last) and stopped is None
     found, deviations = diagnose(probe.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
@@ -82,7 +82,7 @@ def _blur_mm(scene: Scene, data: RegistrationData) -> float:
 
 
 def _diagnosed(run: StageRun, data: RegistrationData) -> StageRun:
-    """The last stage on pixels that are coarse enough to be quick, weighted as it was."""
+    """The last stage on coarser pixels, with the same kind of weights."""
     probe = coarse(replace(run, data=data))
     if "reweight" in run.stage.before:
         probe.objective = probe.objective.reweighted()
@@ -95,54 +95,54 @@ def _converged(history: Sequence[dict[str, Any]], last: Stage) -> bool:
 
 
 class TrainerState(Protocol):
-    """What callbacks may look at, and do, while a registration runs."""
+    """Interface of a running registration for callbacks."""
 
     scene: Scene
     stages: tuple[Stage, ...]
     history: list[dict[str, Any]]
 
     def state_dict(self) -> dict[str, Any]:
-        """A checkpoint from which a run resumes bit by bit."""
+        """A checkpoint from which a run resumes with bit-identical results."""
 
     def stop(self, reason: str) -> None:
-        """Ends the registration after the present iteration."""
+        """End the registration after the current iteration."""
 
 
 class ProgressBar(Callback):
-    """A tqdm bar a stage, with the loss and the last step."""
+    """A tqdm bar for each stage, with the loss and the last step."""
 
     def __init__(self, disable: bool | None = None) -> None:
         self.disable = disable  # None: only on a terminal
         self._bar: tqdm | None = None
 
     def on_stage_start(self, run: TrainerState, index: int, stage: Stage) -> None:
-        """Opens the stage's bar."""
+        """Open the stage's bar."""
         groups = "1 group" if stage.groups == 1 else f"{stage.groups} groups"
         name = f"stage {index + 1}/{len(run.stages)}: {groups}, {stage.optimizer}"
         shown = None if self.disable is None else not self.disable
         self._bar = progress_bar(total=stage.iterations, desc=name, shown=shown)
 
     def on_iteration(self, run: TrainerState, index: int, progress: Progress) -> None:
-        """Moves the bar on."""
+        """Advance the bar."""
         if self._bar is not None:
             self._bar.set_postfix(loss=f"{progress.loss:.5f}", step_mm=f"{progress.step_mm:.4f}", refresh=False)
             self._bar.update(progress.iteration - self._bar.n)
 
     def on_stage_end(self, run: TrainerState, index: int, stage: Stage) -> None:
-        """Closes the bar."""
+        """Close the bar."""
         if self._bar is not None:
             self._bar.close()
 
 
 @dataclass(frozen=True)
 class StageRecord:
-    """How a stage ended.
+    """Outcome of a stage.
 
     Attributes:
-        iterations: How many it took.
-        converged: Whether it ended for another reason than that its iterations, or the time, did.
-        loss: At its end.
-        undone: Why what it did was undone; None where it stands.
+        iterations: Number of iterations.
+        converged: True if it ended before its iterations or the time ran out.
+        loss: Loss at the end.
+        undone: Reason why the stage was undone; None if it was kept.
     """
 
     iterations: int
@@ -155,19 +155,20 @@ class Trainer:
     """Runs the stages of a configuration on a scene and keeps their history.
 
     Args:
-        scene: What is registered; its poses, deformations and intensity model are updated in place.
-        data: What it is registered to.
+        scene: Scene to register; its poses, deformations and intensity model are updated in place.
+        data: Measured data.
         config: Stages, penalties, seed.
         callbacks: Called at the start and end of stages and after each iteration.
-        terms: Similarity, penalties and optimiser in place of, or beside, what the stages say.
-        steps: Steps of your own, by the names that stages call them by.
-        seconds: After so long the registration ends with the iteration it is at.
+        terms: Similarity, penalties and optimiser that replace or extend the stages'.
+        steps: Additional steps, by the names used in stages.
+        seconds: Time limit; after it the registration ends with the current iteration.
 
-    A checkpoint (:meth:`state_dict`) is complete at any time: a trainer that loads it continues with the iteration
-    after, and ends with the same bits as one that was never stopped.
+    A checkpoint (`state_dict`) is complete at any time: a trainer that loads it continues with the next iteration and
+    ends with bit-identical results.
 
     Raises:
-        ValueError: If the implant lies behind a source at its start pose, or a stage names what does not exist.
+        ValueError: If the implant lies behind a source at its start pose, or a stage names an unknown step, optimiser
+            or parameter.
     """
 
     def __init__(
@@ -210,17 +211,17 @@ class Trainer:
                 raise ValueError(f"{unknown[0]!r} cannot be estimated: {', '.join(sorted(known))} can")
 
     def check(self) -> None:
-        """Raises ValueError if an implant lies outside every view at its start pose."""
+        """Raise ValueError if an implant lies outside every view at its start pose."""
         margin = (self.stages[0].margin_mm or 0.0) / self.data.geometry.pixel_spacing[1]
         for assembly in self.scene:
             self.data.windowed(assembly.nodes(1), margin)
 
     def stop(self, reason: str) -> None:
-        """Ends the registration after the present iteration; the result says why."""
+        """End the registration after the current iteration; the result gives the reason."""
         self.stopped = reason
 
     def fit(self) -> RegistrationResult:
-        """Runs the stages that are left and returns the result."""
+        """Run the remaining stages and return the result."""
         self.run()
         return finished(
             self.scene,
@@ -236,7 +237,7 @@ class Trainer:
         )
 
     def run(self) -> float:
-        """Runs the stages that are left; what of the images they leave unexplained."""
+        """Run the remaining stages and return the misfit."""
         while self.next_stage < len(self.stages) and self.stopped is None:
             self._run_stage(self.next_stage)
         return self._guard.misfit
@@ -277,10 +278,10 @@ class Trainer:
             callback.on_stage_end(self, index, stage)
 
     def _begun(self, index: int) -> StageRun:
-        """The run of a stage, its steps taken; or the one that a checkpoint was made in."""
-        stage, kept = self.stages[index], self._kept_run
+        """The run of a stage after its preparing steps, or the run restored from a checkpoint."""
+        stage, optimizer_state = self.stages[index], self._kept_run
         names = stage.before
-        if kept is None:
+        if optimizer_state is None:
             self._guard.before(stage)
         else:
             names = tuple(name for name in names if name not in CHANGE_SCENE)
@@ -297,8 +298,8 @@ class Trainer:
         )
         run.prepare()
         optimizer = run.begin()
-        if kept is not None:
-            optimizer.load_state_dict(kept)
+        if optimizer_state is not None:
+            optimizer.load_state_dict(optimizer_state)
         self._run, self._kept_run = run, None
         return run
 
@@ -312,7 +313,7 @@ class Trainer:
         return {str(i): record.undone for i, record in enumerate(self.records, start=1) if record.undone is not None}
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain types that :meth:`load_state_dict` continues from."""
+        """Checkpoint for `load_state_dict`, as tensors and plain types."""
         run = self._run
         return {
             "registered": self.scene.description(),
@@ -326,13 +327,13 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a checkpoint of the same scene and configuration.
+        """Continue from a checkpoint of the same scene and configuration.
 
         Raises:
             ValueError: If the checkpoint belongs to another scene.
         """
-        own, theirs = self.scene.description(), state.get("registered", {})
-        if differ := sorted(n for n in own.keys() | theirs.keys() if own.get(n) != theirs.get(n)):
+        expected, given = self.scene.description(), state.get("registered", {})
+        if differ := sorted(n for n in expected.keys() | given.keys() if expected.get(n) != given.get(n)):
             raise ValueError(f"the checkpoint does not fit this registration: {', '.join(differ)} differ")
         self.scene.restore(state["scene"])
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])

@@ -1,4 +1,4 @@
-"""How sure images are of parameters: what blocks of pixels disagree about, and what a prior is worth beside them."""
+"""Uncertainty of estimated parameters, from the disagreement of pixel blocks, and the weight of priors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from torchkcreg.geometry import principal_axes
 from torchkcreg.optimization.parameters import ParameterBlocks
 
-_BLOCK_MM = 12.0  # on the detector: residuals of bone edges, beads and scatter hang together over about that much
+_BLOCK_MM = 12.0  # on the detector: correlation length of residuals of bone edges, beads and scatter
 _SEEN = 1e-3  # of the largest curvature: directions that images tell something about
 _ONE_SIDE_DEG = 10.0  # about the implant's long axis: views so near each other show the same bone behind it
 _FOUND = 1.5  # how much further off optima were in simulations where screws were found, see docs/uncertainty.md
@@ -20,15 +20,15 @@ _FOUND_A_SIDE = 1.5  # power of the number of views from one side then: they agr
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What is known of parameters (D,) near the optimum of a stage; second derivatives of the loss, (D, D).
+    """Second derivatives (D, D) of a stage's loss near its optimum, and the covariance that follows.
 
     Attributes:
         images: Curvature of the similarity.
-        disagreement: Sum of the squares of its gradients over blocks of pixels, as much larger as views share what the
-            model lacks.
-        penalties: Curvature of what speaks against parameters but the images.
+        disagreement: Sum of the squares of its gradients over blocks of pixels, multiplied by the factor for views with
+            common model errors.
+        penalties: Curvature of penalties and priors.
         priors: Twice the weight of each prior times its curvature.
-        blocks: How many blocks of pixels say something.
+        blocks: Number of pixel blocks that contribute.
     """
 
     images: Tensor
@@ -51,18 +51,17 @@ class Uncertainty:
         views_a_side: float = 1.0,
         screws_found: bool = False,
     ) -> Uncertainty:
-        """Of residual images.
+        """The uncertainty from residual images.
 
         Args:
-            jacobian: Their derivatives (D, V, 2, rows, cols).
-            residuals: Shape (V, 2, rows, cols).
+            jacobian: Derivatives (D, V, 2, rows, cols) of the residual images.
+            residuals: Residual images, shape (V, 2, rows, cols).
             blocks: The parameters.
             penalty: Of candidates (K, D).
             parameters: The optimum, shape (D,).
             pixel_mm: Of the images.
-            views_a_side: How many views look from one side: all that the model lacks they have in common, and they
-                agree with each other on what is wrong.
-            screws_found: Screws were found, not given: more may be wrong with them than images tell.
+            views_a_side: Number of views that share a direction: their model errors are correlated.
+            screws_found: True if screws were found, not given: their errors exceed what the images show.
         """
         factor = _FOUND**2 * views_a_side**_FOUND_A_SIDE if screws_found else views_a_side
         share = 0.5 / len(residuals)
@@ -82,23 +81,23 @@ class Uncertainty:
     def covariance(self) -> Tensor:
         """Covariance (D, D) of the parameters, mm^2.
 
-        ``C = H^-1 (sum_b g_b g_b^T + 2 w P) H^-1`` (Huber 1967; clusters as in Liang & Zeger 1986): H is the curvature
-        of the loss, penalties included, g_b the share that one block of pixels has in its gradient. The blocks' shares
-        sum to nothing but the penalty's gradient; what they scatter is how far the optimum would move if the blocks had
-        been others. That holds for model error too, which is no noise: what matters is that it hangs together within
-        blocks and not beyond. Between views from one side it does, so that their number multiplies it. Where a penalty
-        is w times the square of deviations from a prior, its curvature P draws the optimum towards what the prior
-        expects, which is as likely off as that says: 2 w P.
+        `C = H^-1 (sum_b g_b g_b^T + 2 w P) H^-1` (Huber 1967; clusters as in Liang & Zeger 1986): H is the curvature
+        of the loss, penalties included, g_b the share that one block of pixels has in its gradient. At the
+        optimum the g_b sum to minus the penalties' gradient. Their spread tells how far the optimum would move if other
+        blocks had been measured. This includes model error if it is correlated within blocks but not beyond. It is
+        correlated between views from similar directions, so the sum is multiplied by their number. A penalty w times
+        the squared deviations from a prior, with curvature P, pulls the optimum towards the prior's mean, which is
+        itself uncertain: this adds 2 w P.
         """
         bread = self._bread()
         return bread @ (self.disagreement + self.priors) @ bread
 
     @property
     def loss_of_a_deviation(self) -> float:
-        """The loss that images alone have where a parameter is one standard deviation off what they say.
+        """Loss of the images for a parameter one standard deviation from their optimum.
 
-        Half the ratio of what blocks of pixels disagree about to curvature; it is about the same in all directions. A
-        prior whose standard deviation costs as much counts as it should beside the images.
+        Half the ratio of the blocks' disagreement to the curvature, about the same in all directions. A prior is
+        weighted correctly if its standard deviation costs the same.
         """
         values, directions = torch.linalg.eigh(self.images)
         seen = values > _SEEN * values.max()
@@ -107,7 +106,7 @@ class Uncertainty:
 
     @property
     def effective_parameters(self) -> float:
-        """How many parameters the images determine, the rest being left to penalties: the trace of H^-1 H_images."""
+        """Number of parameters determined by the images rather than penalties: the trace of H^-1 H_images."""
         return float((self._bread() @ self.images).trace())
 
     def _bread(self) -> Tensor:
@@ -117,14 +116,14 @@ class Uncertainty:
 
 
 def views_a_side(sources: Tensor, nodes: Tensor) -> float:
-    """How many of the views from sources (V, 3) look at an implant of nodes (N, 3) from one side, on average."""
+    """Average number of views from sources (V, 3) that share a direction onto an implant of nodes (N, 3)."""
     return float(likeness(sources, nodes).sum() / len(sources))
 
 
 def likeness(sources: Tensor, nodes: Tensor) -> Tensor:
-    """How much each pair of views from sources (V, 3) looks at an implant of nodes (N, 3) from one side, (V, V).
+    """Similarity of direction (V, V) of pairs of views from sources (V, 3) onto an implant of nodes (N, 3).
 
-    1 for the same side, 0 for others, by the angle between them about the implant's long axis.
+    1 for the same direction, towards 0 for others, by the angle between them about the implant's long axis.
     """
     center, (*_, axis) = principal_axes(nodes)
     rays = torch.nn.functional.normalize(center - sources, dim=-1)

@@ -1,4 +1,4 @@
-"""Whether a registration can be trusted: what is measured of it, and what is said about that."""
+"""Verdict on a registration: diagnostics, thresholds and reasons in words."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from typing import Literal
 
 Status = Literal["ok", "doubtful", "failed"]
 
-# Each threshold is where a simulated population parts best, see docs/verdict.md.
+# Each threshold best separates good from bad cases of a simulated population, see docs/verdict.md.
 _UNRELATED, _WEAK = 0.3, 0.6  # gradient correlation
 _NOTHING, _UNEXPLAINED = 0.2, 0.08  # misfit
 _DEVIATION_MM, _ANYWHERE_MM = 0.11, 0.5
-_DEVIATION_FOUND_MM = 0.085  # with screws that nobody told of: their metal and shape may be others
+_DEVIATION_FOUND_MM = 0.085  # with found screws: their metal and shape may be wrong
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.0035  # root mean square strain
 _SURPRISING = 4.0  # mean square of loads in standard deviations; of plates on screws it is one, and up to 2.7
-_APART_MM, _ALIKE = 2.0, 1.2  # another place, and how much more it leaves unexplained
+_APART_MM, _ALIKE = 2.0, 1.2  # least distance of another place, and largest ratio of misfits
 
 
 @dataclass(frozen=True)
 class Rival:
-    """The second best of the places that were tried.
+    """Second best of the places tried.
 
     Attributes:
         distance_mm: Root mean square distance of the implants' nodes there from where they fit best.
-        misfit: What is left unexplained of the images there.
-        best_misfit: What is left where they fit best.
+        misfit: Unexplained share of the images there.
+        best_misfit: Unexplained share at the best place.
     """
 
     distance_mm: float
@@ -35,25 +35,25 @@ class Rival:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What tells a good registration from a bad one.
+    """Measures that distinguish good registrations from bad ones.
 
     Attributes:
         gc: Gradient correlation of each view.
-        misfit: What the last stage's contrast left unexplained.
+        misfit: Unexplained share of the images' contrast in the last stage.
         node_std_mm: Expected root mean square error of the implant's nodes.
         seen: Share of the implant's volume that each view shows.
         strain: Root mean square strain of the implant.
-        folds: Whether the deformation folds over somewhere in the implant.
-        converged: Whether the last stage ended before its iterations did.
+        folds: True if the deformation folds over somewhere in the implant.
+        converged: True if the last stage ended before its last iteration.
         at_bounds: Parameters of the intensity model that ended at a bound.
         undone: Number of each stage that was undone, from 1 on, and why.
-        rival: Where the implant fitted second best, if several places were tried.
-        screws_found: How many screws were found that nobody told of.
-        surprise: Mean square of what the deformation's prior was told of, in its standard deviations.
-        effective_parameters: How many parameters the images determine.
-        blocks: How many blocks of pixels say something.
-        view_motion_mm: How far views were found to be off the geometry, root mean square at the nodes; None where they
-            were not, or it was not asked.
+        rival: Second best place of the implant, if several were tried.
+        screws_found: Number of screws that were found, not given.
+        surprise: Mean square of the loads in the prior's standard deviations.
+        effective_parameters: Number of parameters determined by the images.
+        blocks: Number of pixel blocks that contribute to the error estimate.
+        view_motion_mm: Estimated motion of the views, root mean square at the nodes; None if not estimated or not
+            significant.
     """
 
     gc: list[float]

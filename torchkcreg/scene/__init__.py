@@ -1,6 +1,4 @@
-"""What is in the beam and what is seen of it: implants with their poses, deformations and components (`Assembly`), the
-scene they make, which renders itself, the measured images, and all that may be changed to make both agree.
-"""
+"""Implants (`Assembly`), the scene that renders them, the measured images, and the parameters of a stage (`Moves`)."""
 
 from .assembly import Assembly, followed_motion
 from .background import with_background

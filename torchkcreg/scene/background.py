@@ -1,4 +1,4 @@
-"""What the model does not know, as a smooth path length: bone, water, soft tissue."""
+"""Estimated background (bone, water, soft tissue) as a smooth path length."""
 
 from __future__ import annotations
 
@@ -16,29 +16,28 @@ from .scene import Scene
 _ITERATIONS = 4
 _PROBE_MM = 0.5
 _COARSEST_BIN = 4
-_LEAST_MEASURED = 0.01  # of a window: where fewer pixels are valid nothing is known of the background
+_LEAST_MEASURED = 0.01  # of a window: with fewer valid pixels the background is not estimated
 _LEAST_SLOPE = 1e-3  # 1/mm, of the logarithm of the signal
 _RANGE_MM = (-100.0, 2000.0)  # a limb's thickness in any view, and errors of the model on the other side
 
 
 @torch.no_grad()
 def with_background(scene: Scene, data: RegistrationData, smoothness_mm: float) -> RegistrationData:
-    """The data with a path length B of the intensity model's background, which stands for what is not known.
+    """The data with an estimated path length B of background material.
 
-    The measured transmission is ``T(B) + s`` with T of the known components behind a background B, and the scatter s.
-    Within a Gaussian window of ``smoothness_mm`` a factor of T is fitted by least squares,
-    ``r = G (T (I - s)) / G (T T)``, and B moves by Newton's rule until it is one. Pixels behind thick metal hardly
-    count, so that B goes on under the implant from its surroundings. It is too smooth to take over edges that the
-    implant should explain, but behind bone or water it sets how hard the beam is and how much of the signal is
-    scatter, which decides how an edge looks.
+    The measured transmission is `T(B) + s` with T of the known components behind a background B, and the scatter s.
+    Within a Gaussian window of `smoothness_mm` a factor of T is fitted by least squares,
+    `r = G (T (I - s)) / G (T T)`, and B is changed by Newton steps until that factor is one. Pixels behind thick metal
+    hardly count, so B under the implant continues its surroundings. B is too smooth to explain edges of the implant.
+    But it determines beam hardness and scatter fraction behind bone or water, and thus the contrast of an edge.
 
     Args:
-        scene: Implants near their poses, with an intensity model that knows a background.
+        scene: Implants near their poses, with an intensity model that has a background.
         data: Projections.
         smoothness_mm: Standard deviation of the window at the detector.
 
     Raises:
-        ValueError: If the intensity model knows no background.
+        ValueError: If the intensity model has no background.
     """
     if not scene.intensity.has_background:
         raise ValueError(f"{type(scene.intensity).__name__} knows no background that could be estimated")
@@ -47,7 +46,7 @@ def with_background(scene: Scene, data: RegistrationData, smoothness_mm: float) 
 
 
 class _BackgroundFit:
-    """The background that goes with the parameters of the intensity model."""
+    """Least-squares fit of the background for the present intensity model."""
 
     def __init__(self, scene: Scene, data: RegistrationData, width_mm: float) -> None:
         coarse = int(PIXELS_OF_SIGMA * width_mm / data.geometry.pixel_spacing[1])

@@ -1,4 +1,4 @@
-"""The measured side of a registration: projections, their geometry and the pixels that count."""
+"""Measured data of a registration: projections, their geometry and masks."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class RegistrationData:
 
     Attributes:
         geometry: V views.
-        line_integrals: -ln(I / I0), shape (V, rows, cols); in float64 all images of a registration are.
+        line_integrals: -ln(I / I0), shape (V, rows, cols); their dtype sets that of all rendered images.
         mask: True where a pixel counts, shape (V, rows, cols); all pixels when None was given.
-        background: Path length of what the known components lack (bone, water) through one material that stands for
-            it, shape (V, rows, cols), mm; None where nothing is known of it.
-        background_mm: Smoothness of an estimated background, standard deviation in mm at the detector; it then follows
-            each candidate. 0 where the background is known.
-        scatter_shapes: How scatter is spread over the detector, shape (2, V, rows, cols), see
-            :func:`torchkcreg.physics.scatter_shapes`; evenly if None.
+        background: Path length of all but the known components (bone, water), expressed in one background material,
+            shape (V, rows, cols), mm; None if unknown.
+        background_mm: Smoothness of an estimated background, standard deviation in mm at the detector; it is then
+            refitted to each candidate. 0 if the background is known.
+        scatter_shapes: Distribution of scatter over the detector, shape (2, V, rows, cols), see
+            `torchkcreg.physics.scatter_shapes`; uniform if None.
 
     Raises:
-        ValueError: If the views or the pixels of geometry and images differ, or no pixel is left.
+        ValueError: If the views or the pixels of geometry and images differ, or a view has no valid pixel.
     """
 
     geometry: ConeBeamGeometry
@@ -73,7 +73,7 @@ class RegistrationData:
     def of_transmission(
         cls, geometry: ConeBeamGeometry, transmission: Tensor, mask: Tensor | None = None
     ) -> RegistrationData:
-        """Of measured intensities over the open beam's, (V, rows, cols), floored where nothing arrives."""
+        """Data of measured transmissions I / I0 (V, rows, cols), limited from below to 1e-6."""
         lines = -transmission.clamp_min(_LEAST_TRANSMISSION).log()
         return cls(geometry, lines, mask)  # type: ignore[arg-type]
 
@@ -88,17 +88,17 @@ class RegistrationData:
         return replace(self, geometry=copy.deepcopy(self.geometry).to(device), **moved)
 
     def facing(self, points: Tensor) -> RegistrationData:
-        """The data with these world points (N, 3) in front of every source, see :meth:`ConeBeamGeometry.facing`."""
+        """The data with these world points (N, 3) in front of every source, see `ConeBeamGeometry.facing`."""
         return replace(self, geometry=self.geometry.facing(points))
 
     def select(self, views: list[int]) -> RegistrationData:
-        """The given views alone, in the given order."""
+        """The given views, in the given order."""
         estimates = self._estimates(lambda image: image[views])
         lines, mask = self.line_integrals[views], self.mask[views]
         return replace(self, geometry=self.geometry.select(views), line_integrals=lines, mask=mask, **estimates)
 
     def binned(self, factor: int) -> RegistrationData:
-        """Data on pixels ``factor`` times as large: transmissions are averaged over the pixels that count.
+        """Data on pixels `factor` times as large: transmissions are averaged over the pixels that count.
 
         A binned pixel counts if at least half of its pixels do.
         """
@@ -115,9 +115,9 @@ class RegistrationData:
         return RegistrationData(self.geometry.bin(factor), line_integrals, share >= 0.5, **self._estimates(mean))
 
     def windowed(self, points: Tensor, margin_px: float) -> RegistrationData:
-        """Data cropped, view by view, to the projection of ``points`` and a margin.
+        """Data cropped, view by view, to the projection of `points` and a margin.
 
-        All windows have one size; what a window has beyond the detector is masked. The matrices carry the offsets.
+        All windows have the same size; pixels beyond the detector are masked. The matrices include the offsets.
 
         Args:
             points: World positions, shape (N, 3), mm.
@@ -150,7 +150,7 @@ class RegistrationData:
             return cut
 
         def continued(image: Tensor) -> Tensor:
-            """An estimate goes on beyond the detector, from where the blur of a DRR mixes it in."""
+            """Estimate extended beyond the detector by its edge values, since the blur of a DRR reaches there."""
             sizes = ((size_v, low[:, 1:]), (size_u, low[:, :1]))
             v, u = (torch.arange(size, device=low.device) + first for size, first in sizes)
             views = torch.arange(self.num_views, device=low.device)[:, None, None]
@@ -167,7 +167,7 @@ class RegistrationData:
         return RegistrationData(geometry, window(self.line_integrals), window(self.mask), **estimates)
 
     def with_scatter_shapes(self, sigma_mm: float) -> RegistrationData:
-        """The data with the shapes of the scatter, ``sigma_mm`` broad at the detector."""
+        """The data with scatter shapes of standard deviation `sigma_mm` at the detector."""
         factor = min(_SCATTER_BLOCK, *self.geometry.det_shape)
         sigma = sigma_mm / self.geometry.pixel_spacing[1] / factor
         transmission = adaptive_avg_pool2d(torch.exp(-self.line_integrals) * self.mask, self._blocks(factor))
@@ -180,7 +180,7 @@ class RegistrationData:
         return max(1, rows // factor), max(1, cols // factor)
 
     def _estimates(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-        """What is estimated about the images, each image changed."""
+        """The estimated images, each transformed by `change`."""
         background = None if self.background is None else change(self.background)
         shapes = None if self.scatter_shapes is None else torch.stack([change(s) for s in self.scatter_shapes])
         return {"background": background, "scatter_shapes": shapes, "background_mm": self.background_mm}

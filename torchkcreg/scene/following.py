@@ -1,4 +1,4 @@
-"""A background that goes with every candidate, so that it does not hold the implant where it was estimated."""
+"""Background refitted to every candidate, so that it does not hold the implant where it was estimated."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ _RANGE = (0.1, 10.0)  # of the factor
 
 
 class FollowingBackground:
-    """DRRs whose background follows whatever else changes them.
+    """DRRs with a background refitted to each candidate.
 
-    A background that was estimated with the implant somewhere explains a part of the images that the implant would
-    explain elsewhere, and holds it there. So it is fitted to each candidate (variable projection, Golub & Pereyra
+    A background estimated with the implant at one place explains part of the images that the implant would explain
+    elsewhere, and so holds it there. So it is fitted to each candidate (variable projection, Golub & Pereyra
     1973): the primary T of a DRR is scaled by the factor r that explains the measured intensity I best within a
-    Gaussian window, ``r = G (T (I - s)) / G (T T)``, with the scatter s.
+    Gaussian window, `r = G (T (I - s)) / G (T T)`, with the scatter s.
 
     Args:
         measured: Line integrals -ln I, shape (V, rows, cols).
-        mask: Where they count.
-        scatter_shapes: How scatter is spread over the detector, shape (2, V, rows, cols); evenly if None.
+        mask: True where a pixel counts.
+        scatter_shapes: Distribution of scatter over the detector, shape (2, V, rows, cols); uniform if None.
         sigma_px: Smoothness of the background, pixels.
     """
 
@@ -35,18 +35,18 @@ class FollowingBackground:
         self.sigma = sigma_px / self.block
 
     def __call__(self, lines: Tensor, levels: Tensor) -> Tensor:
-        """DRRs (K, V, rows, cols) with the background that goes with them.
+        """DRRs (K, V, rows, cols) including the background fitted to them.
 
         Args:
-            lines: DRRs, zero where nothing stands in the beam.
-            levels: Of both kinds of scatter, shape (K, 2).
+            lines: DRRs, zero in the open beam.
+            levels: Levels of both kinds of scatter, shape (K, 2).
         """
         level = levels[:, 0].to(lines)[:, None, None, None]
         scattered = scattered_signal(levels.to(lines), self.scatter_shapes)
         primary = ((1 + level) * torch.exp(-lines) - scattered).clamp_min(_LEAST)
         seen = primary * self.mask
-        wanted = self._smooth(seen * (self.intensity - scattered))
-        factor = (wanted / self._smooth(seen * primary).clamp_min(_LEAST**2)).clamp(*_RANGE)
+        correlation = self._smooth(seen * (self.intensity - scattered))
+        factor = (correlation / self._smooth(seen * primary).clamp_min(_LEAST**2)).clamp(*_RANGE)
         return torch.log1p(level) - torch.log(self._enlarged(factor) * primary + scattered)
 
     def _smooth(self, images: Tensor) -> Tensor:

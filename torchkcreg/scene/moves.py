@@ -1,4 +1,4 @@
-"""All that a stage may change in a scene, as named blocks of one vector of parameters."""
+"""Parameters of a stage as named blocks of one vector, and the scene states they lead to."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class BoundMotion:
     """Placements of an assembly as a function of the steps of its motion.
 
     Args:
-        assembly: In its present state.
-        motion: Of its deformation from there.
-        nodes: The implant's nodes (N, 3) that are rendered.
+        assembly: Assembly in its present state.
+        motion: Motion of its deformation from there.
+        nodes: Rendered nodes (N, 3) of the implant.
     """
 
     def __init__(self, assembly: Assembly, motion: Motion, nodes: Tensor) -> None:
-        self.motion, self.pose = motion, assembly.implant_to_world.clone()
+        self.motion, self.pose = motion, assembly.implant_to_world.detach()
         self.turns = rotation_about(assembly.heads, assembly.tilts)
         self.nodes = self._bound(nodes.double(), nodes.dtype)
         self.at_rest = assembly.followed
@@ -47,12 +47,12 @@ class BoundMotion:
         return transform_points(self.pose, points).to(dtype), self.motion.features(points).to(dtype)
 
     def __call__(self, steps: Tensor, component_motions: Tensor | None = None) -> Placement:
-        """Placements of steps (K, D).
+        """Placements for steps (K, D).
 
         Args:
-            steps: Of the motion.
-            component_motions: Motions (K, C, 4, 4) of the components in the implant's frame beside following it; those
-                that they have now when None.
+            steps: Steps of the motion.
+            component_motions: Motions (K, C, 4, 4) of the components in the implant's frame, in addition to following
+                it; their present tilts when None.
         """
         coefficients = self.motion.coefficients(steps) @ self.pose[:3, :3].T
         turns = self.turns if component_motions is None else component_motions
@@ -70,11 +70,11 @@ def _moved(bound: tuple[Tensor, Tensor], coefficients: Tensor) -> Tensor:
 
 
 class ScrewPaths:
-    """Path lengths (V, rows, cols) in mm of screws where an assembly, as it is, would have them.
+    """Path lengths (V, rows, cols), mm, of screws moved with an assembly in its present state.
 
     Args:
-        assembly: It must not move meanwhile.
-        view: Of it.
+        assembly: Assembly; it must not move while this is used.
+        view: View that contains it.
     """
 
     def __init__(self, assembly: Assembly, view: View) -> None:
@@ -83,7 +83,7 @@ class ScrewPaths:
 
     @torch.no_grad()
     def __call__(self, screw: Screw) -> Tensor:
-        """Of a screw, given in the implant's frame."""
+        """Path lengths of a screw given in the implant's frame."""
         pose = self.assembly.implant_to_world
         if screw.start not in self._motions:
             self._motions[screw.start] = pose @ self.assembly.motion_at(pose.new_tensor(screw.start))
@@ -91,17 +91,17 @@ class ScrewPaths:
 
 
 class Moves(ParameterBlocks):
-    """What a stage may change in a scene: increments to its state when they are made, in mm or worth as much.
+    """Parameters of a stage: changes of a scene from its present state, in mm or scaled like mm.
 
     Args:
-        scene: In its present state.
-        view: Of it.
-        level: How finely deformations move.
-        estimate: Parameters of the intensity model that are estimated along.
-        screws: Lengths and radii of found screws are, too.
-        tilts: Components may turn a little about their heads.
-        views: Views may move, if the scene has motions of views.
-        prior_weight: Loss for a parameter of the intensity model, or a tilt, that is a standard deviation off.
+        scene: Scene in its present state.
+        view: View of the scene.
+        level: Fineness of the deformations.
+        estimate: Parameters of the intensity model to estimate.
+        screws: Estimate lengths and radii of found screws.
+        tilts: Estimate small rotations of components about their heads.
+        views: Estimate motions of views, if the scene has them.
+        prior_weight: Loss for one standard deviation of a parameter of the intensity model or of a tilt.
     """
 
     def __init__(
@@ -136,18 +136,18 @@ class Moves(ParameterBlocks):
         super().__init__(blocks)
 
     def seen_in(self, view: View) -> Moves:
-        """The same moves, with the same parameters, as another view of the same scene shows them."""
-        other = copy.copy(self)
-        other.view, other._blocks = view, dict(self._blocks)
-        other.physics = other._blocks["physics"] = self.physics.on_pixels(view.pixel_px)
-        other.parts = [part.seen_in(view, nodes) for part, nodes in zip(self.parts, view.nodes, strict=True)]
-        for part in other.parts:
+        """The same parameters, rendered in another view of the same scene."""
+        copied = copy.copy(self)
+        copied.view, copied._blocks = view, dict(self._blocks)
+        copied.physics = copied._blocks["physics"] = self.physics.on_pixels(view.pixel_px)
+        copied.parts = [part.seen_in(view, nodes) for part, nodes in zip(self.parts, view.nodes, strict=True)]
+        for part in copied.parts:
             if part.shapes:
-                other._blocks[f"screws of {part.name}"] = part.shapes
-        return other
+                copied._blocks[f"screws of {part.name}"] = part.shapes
+        return copied
 
     def state(self, parameters: Tensor) -> State:
-        """The scene's candidates with parameters (K, D)."""
+        """Candidate states of the scene for parameters (K, D)."""
         steps = self.split(parameters)
         added: dict[str, Tensor] = {}
         placements = []
@@ -161,7 +161,7 @@ class Moves(ParameterBlocks):
         return State(tuple(placements), self.physics.arguments(steps["physics"]), added, views)
 
     def displacements(self, parameters: Tensor) -> Tensor:
-        """Displacements (K, S) of all implants' nodes, so weighted that their squares sum to the mean square, mm^2."""
+        """Displacements (K, S) of all nodes, weighted so that their squares sum to the mean square, mm^2."""
         steps = self.split(parameters)
         return (
             torch.cat([part.displacements(steps[f"motion of {part.name}"]) for part in self.parts], dim=-1)
@@ -170,20 +170,20 @@ class Moves(ParameterBlocks):
 
     @torch.no_grad()
     def shift(self, number: int, direction: Tensor) -> Tensor:
-        """The step (D,) that shifts an assembly, by its number, by 1 mm along a direction (3,) of its own frame."""
+        """Step (D,) that shifts assembly `number` by 1 mm along a direction (3,) of its implant's frame."""
         part, name, direction = self.parts[number], f"motion of {self.parts[number].name}", direction.double()
         offsets = _DIFFERENCE_MM * torch.eye(self[name].num_parameters, dtype=torch.float64, device=direction.device)
         slopes = (part.displacements(offsets) - part.displacements(-offsets)) / (2 * _DIFFERENCE_MM)
-        wanted = (part.share * direction).flatten()
+        shifted = (part.share * direction).flatten()
         steps = {name: block.at_rest(direction.device)[0] for name, block in self.items()}
-        steps[name] = torch.linalg.lstsq(slopes.T, wanted[:, None]).solution[:, 0]
+        steps[name] = torch.linalg.lstsq(slopes.T, shifted[:, None]).solution[:, 0]
         return torch.cat(list(steps.values()))
 
     @torch.no_grad()
     def slopes(self, number: int) -> tuple[Tensor, Tensor]:
-        """Nodes (N, 3) of an assembly, by its number, and how far a unit of each step of its motion moves them.
+        """Nodes (N, 3) of assembly `number` and their derivatives (D, N, 3) by the steps of its motion.
 
-        Steps from rest, in the world's axes: (D, N, 3).
+        Derivatives are taken at rest, in the world's axes.
         """
         motion, pose = self.parts[number].bound.motion, self.parts[number].bound.pose
         points = self.parts[number].assembly.implant.coarsened_to(_DEVIATIONS_PITCH_MM).points.double()
@@ -192,16 +192,16 @@ class Moves(ParameterBlocks):
         return points, motion.features(points) @ (change / (2 * _DIFFERENCE_MM)) @ pose[:3, :3].mT
 
     def keep_covariance(self, covariance: Tensor) -> list[Tensor]:
-        """Tells each motion the covariance of its steps, out of that of all parameters (D, D), and returns them."""
+        """Pass to each motion its block of the covariance (D, D) of all parameters; return these blocks."""
         places = [self.places[f"motion of {part.name}"] for part in self.parts]
-        own = [covariance[place, place] for place in places]
-        for part, known in zip(self.parts, own, strict=True):
-            part.bound.motion.keep_covariance(known)
-        return own
+        covariances = [covariance[place, place] for place in places]
+        for part, block in zip(self.parts, covariances, strict=True):
+            part.bound.motion.keep_covariance(block)
+        return covariances
 
     @torch.no_grad()
     def accept(self, parameters: Tensor) -> None:
-        """Moves the scene to parameters (D,); common rigid motions go from the deformations into the poses."""
+        """Move the scene to parameters (D,); rigid parts of the deformations are moved into the poses."""
         steps = self.split(parameters)
         for part in self.parts:
             part.accept(steps)
@@ -211,7 +211,7 @@ class Moves(ParameterBlocks):
 
 
 class _Part:
-    """What a stage may change of one assembly."""
+    """Parameters of one assembly in a stage."""
 
     def __init__(self, assembly: Assembly, view: View, nodes: Tensor, level: Level) -> None:
         self.assembly, self.name = assembly, assembly.name
@@ -224,11 +224,11 @@ class _Part:
         self.features = self.bound.motion.features(coarse.points)
 
     def screw_shapes(self, view: View) -> ScrewShapes:
-        """How the found screws' lengths and radii change the images of a view."""
+        """Parameters of the found screws' lengths and radii in a view."""
         return ScrewShapes(self.assembly.found, ScrewPaths(self.assembly, view))
 
     def seen_in(self, view: View, nodes: Tensor) -> _Part:
-        """The same, with other nodes that are rendered."""
+        """The same parameters with other rendered nodes."""
         other = copy.copy(self)
         other.bound = BoundMotion(self.assembly, self.bound.motion, nodes)
         other.shapes = self.screw_shapes(view) if self.shapes else None
@@ -239,10 +239,10 @@ class _Part:
         return (combined(self.features, self.bound.motion.coefficients(steps)) * self.share).flatten(1)
 
     def accept(self, steps: dict[str, Tensor]) -> None:
-        """Moves the assembly."""
+        """Move the assembly by the steps."""
         assembly = self.assembly
         common = self.bound.motion.accept(steps[f"motion of {self.name}"])
-        assembly.implant_to_world.copy_(assembly.implant_to_world @ common)
+        assembly.implant_to_world = assembly.implant_to_world @ common
         if self.tilts:
             assembly.tilts = self.tilts.vectors(steps[f"tilts of {self.name}"]).clone()
         if assembly.found and (self.shapes or self.tilts):

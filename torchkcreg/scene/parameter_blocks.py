@@ -1,4 +1,4 @@
-"""Parameters of the intensity model that are estimated beside the motion."""
+"""Parameters estimated beside the motion: intensity model, component tilts, lengths and radii of found screws."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchkcreg.physics import IntensityModel
 
 from .assembly import Assembly
 
-_LIKELY_DEG = 1.0  # of a component whose direction was told
+_LIKELY_DEG = 1.0  # of a given component
 _LIKELY_FOUND_DEG = 3.0  # of a screw that was found along its hole
 _LIKELY_SHIFT_MM = 0.2  # of a found screw's head: a hole is that much wider than the screw
 _LENGTH_STEP_MM = 0.5
@@ -29,10 +29,10 @@ class PhysicsParameters(ParameterBlock):
     """Steps of an intensity model's parameters, scaled like millimetres.
 
     Args:
-        intensity: The model; of the names it does not offer, none is estimated.
-        names: Parameters to estimate, as :attr:`IntensityModel.free` calls them.
+        intensity: The model; names that it does not offer are ignored.
+        names: Parameters to estimate, as `IntensityModel.free` calls them.
         pixel_px: Edge of the rendered pixels, in the detector's; the model keeps its blur in the latter.
-        weight: Loss for a parameter that is a standard deviation off where it most likely is.
+        weight: Loss for a parameter one standard deviation from its most likely value.
     """
 
     def __init__(self, intensity: IntensityModel, names: Sequence[str], pixel_px: float, weight: float) -> None:
@@ -49,7 +49,7 @@ class PhysicsParameters(ParameterBlock):
         self.width = self._numbers(f.deviation for f in self.free)
 
     def on_pixels(self, pixel_px: float) -> PhysicsParameters:
-        """The same for images of other rendered pixels."""
+        """The same parameters for rendered pixels of another size."""
         other = copy.copy(self)
         other.pixel_px = pixel_px
         return other
@@ -59,7 +59,7 @@ class PhysicsParameters(ParameterBlock):
         return torch.tensor(list(values), dtype=torch.float64, device=device)
 
     def penalty(self, steps: Tensor) -> Tensor:
-        """Squared distances (K,) from where the parameters most likely are, in standard deviations, weighted."""
+        """Weighted squared distances (K,) from the most likely values, in standard deviations."""
         return self.weight * ((self.values(steps) - self.center) / self.width).square().sum(-1)
 
     def clamp(self, steps: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ class PhysicsParameters(ParameterBlock):
         return torch.minimum(torch.maximum(steps, self.low), self.high)
 
     def at_bounds(self, share: float) -> list[str]:
-        """Names of the parameters that are within a share of their range of a bound where they are not likely to be."""
+        """Names of parameters within this share of their range of a bound that is not their most likely value."""
         margin = share * (self.high - self.low)
         likely = (self.center - self.start) / self.scale
         near = ((self.low > -margin) & (likely > self.low)) | ((self.high < margin) & (likely < self.high))
@@ -80,12 +80,12 @@ class PhysicsParameters(ParameterBlock):
     def arguments(self, steps: Tensor) -> dict[str, Tensor]:
         """Keyword arguments of the intensity model, each of shape (K,)."""
         values = {f.attribute: v for f, v in zip(self.free, self.values(steps).unbind(-1), strict=True)}
-        own = self.intensity.arguments(self.pixel_px, **values)
-        return {name: value.expand(len(steps)) for name, value in own.items()}
+        arguments = self.intensity.arguments(self.pixel_px, **values)
+        return {name: value.expand(len(steps)) for name, value in arguments.items()}
 
     @torch.no_grad()
     def accept(self, steps: Tensor) -> None:
-        """Writes the stepped values into the model."""
+        """Write the values after the steps into the model."""
         for free, value in zip(self.free, self.values(steps), strict=True):
             getattr(self.intensity, free.attribute).fill_(float(value))
 
@@ -93,13 +93,13 @@ class PhysicsParameters(ParameterBlock):
 class ComponentTilts(ParameterBlock):
     """Rotations of components about their heads, as millimetres at their far ends, and shifts of found screws' heads.
 
-    A screw is long: what the smooth deformation makes of a plate's rotation at its hole, a tenth of a degree off, moves
-    its tip by more than the plate's own error. With its direction fixed to the plate the long edges of its image would
-    bend the plate. A screw that was found may besides sit anywhere in its hole, which is wider than it.
+    A screw is long: an error of a tenth of a degree in the plate's rotation at its hole moves the screw's tip by more
+    than the plate's own error. If its direction were fixed to the plate, the long edges of its image would bend the
+    plate. The head of a found screw may also shift within its hole, which is wider than the screw.
 
     Args:
-        assembly: With its components and how they are tilted so far.
-        weight: Loss for a tilt or shift of a standard deviation.
+        assembly: Assembly with its components and their present tilts.
+        weight: Loss for a tilt or shift of one standard deviation.
     """
 
     def __init__(self, assembly: Assembly, weight: float) -> None:
@@ -111,7 +111,7 @@ class ComponentTilts(ParameterBlock):
         self.across = torch.stack([across(axis) for axis in axes])
         self.shift = bool(assembly.found)
         self.likely = math.radians(_LIKELY_FOUND_DEG if assembly.found else _LIKELY_DEG)
-        self.num_parameters = (4 if self.shift else 2) * len(components)  # four, where heads shift
+        self.num_parameters = (4 if self.shift else 2) * len(components)  # four if heads shift
 
     def vectors(self, steps: Tensor) -> Tensor:
         """Rotation vectors (K, C, 3) in the implant's frame after steps (K, D), mm at the far ends."""
@@ -119,7 +119,7 @@ class ComponentTilts(ParameterBlock):
         return self.assembly.tilts + (angles[..., None] * self.across).sum(-2)
 
     def shifts(self, steps: Tensor) -> Tensor:
-        """How far the heads move across the axes after steps (K, D), shape (K, C, 3), mm in the implant's frame."""
+        """Shifts (K, C, 3) of the heads across the axes after steps (K, D), mm in the implant's frame."""
         if not self.shift:
             return steps.new_zeros(*steps.shape[:-1], len(self.lengths), 3)
         lengths = steps[..., 2 * len(self.lengths) :].unflatten(-1, (-1, 2))
@@ -137,11 +137,11 @@ class ComponentTilts(ParameterBlock):
 
 
 class ScrewShapes(ParameterBlock):
-    """Lengths, then radii of found screws as parameters, linear in the images.
+    """Lengths, then radii of found screws; path lengths are linearised in them.
 
     Args:
         screws: The screws.
-        render: Path lengths (V, rows, cols) of a screw where it now is.
+        render: Gives the path lengths (V, rows, cols) of a screw at its present place.
     """
 
     def __init__(self, screws: Sequence[Screw], render: Callable[[Screw], Tensor]) -> None:
@@ -159,18 +159,18 @@ class ScrewShapes(ParameterBlock):
         ]
         materials = 2 * [s.material for s in self.screws]
         self.slopes = {
-            name: torch.stack([slope * (name == other) for slope, other in zip(slopes, materials, strict=True)])
+            name: torch.stack([slope * (name == material) for slope, material in zip(slopes, materials, strict=True)])
             for name in dict.fromkeys(materials)
         }
 
     def clamp(self, steps: Tensor) -> Tensor:
-        """Steps (K, S) within what the linear images hold for."""
+        """Steps (K, S) limited to the range in which the linearisation holds."""
         length, radius = _LARGEST_STEPS
         lengths, radii = steps.chunk(2, dim=-1)
         return torch.cat([lengths.clamp(-length, length), radii.clamp(-radius, radius)], dim=-1)
 
     def added(self, steps: Tensor) -> dict[str, Tensor]:
-        """What steps (K, S) add to the path lengths of each material, shape (K, V, rows, cols)."""
+        """Path lengths (K, V, rows, cols) that steps (K, S) add to each material."""
         return {name: torch.tensordot(steps.to(slopes), slopes, dims=1) for name, slopes in self.slopes.items()}
 
     def stepped(self, steps: Tensor) -> list[Screw]:

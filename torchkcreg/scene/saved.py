@@ -18,7 +18,7 @@ _CLOUD = ("points", "volumes", "cell")
 
 
 def scene_to_dict(scene: Scene) -> dict[str, Any]:
-    """All that `scene_from_dict` needs to render the scene alike; holes, which it no longer needs, are left out."""
+    """The scene as a dict for `scene_from_dict`; the implants' holes are left out."""
     return {
         "assemblies": [_assembly_to_dict(assembly) for assembly in scene],
         "intensity": scene.intensity.to_dict(),
@@ -29,10 +29,10 @@ def scene_to_dict(scene: Scene) -> dict[str, Any]:
 
 
 def scene_from_dict(content: Any) -> Scene:
-    """The scene that `scene_to_dict` described.
+    """The scene that `scene_to_dict` wrote.
 
     Raises:
-        ValueError: A key is missing or malformed; the message names it.
+        ValueError: If a key is missing or malformed; the message names it.
     """
     require_keys(content, ("assemblies", "intensity", "materials"), " of a scene")
     return Scene(
@@ -61,7 +61,7 @@ def _assembly_to_dict(assembly: Assembly) -> dict[str, Any]:
         "material": assembly.material,
         "cloud": _cloud_to_dict(assembly.implant),
         "deformation": assembly.deformation.to_dict(),
-        "implant_to_world": assembly.implant_to_world,
+        "implant_to_world": assembly.implant_to_world.detach(),
         "components": components,
         "tilts": assembly.tilts,
         "follow_radius_mm": assembly.follow_radius_mm,

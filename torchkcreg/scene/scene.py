@@ -1,4 +1,4 @@
-"""A scene: implants in the beam and what the beam makes of them."""
+"""A scene of implants that renders its own X-ray images."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from .view_motions import ViewMotions
 
 
 class Scene(nn.Module):
-    """Implants with their poses, deformations and components, and the model of the intensity behind them.
+    """Implants with their poses, deformations and components, and the intensity model.
 
-    Called with a geometry it gives the line integrals that its views show, differentiable in all of the scene's
-    parameters.
+    Calling it with a geometry gives the line integrals of the geometry's views, differentiable in all parameters of the
+    scene.
 
     Args:
         assemblies: One implant or several, each with what is fixed to it.
-        intensity: Path lengths of the materials, in the order of :attr:`materials`, to line integrals.
-        metals: Names of materials that screws found in the implants' holes may be of, besides the implants' own.
+        intensity: Maps path lengths of the materials, in the order of `materials`, to line integrals.
+        metals: Possible materials of screws found in the implants' holes, besides the implants' own.
         materials: Names in the order of the path lengths; those of implants, metals and components when None.
-        backend: Of the projector: "auto", "cpp", "triton" or "torch".
+        backend: Projector: "auto", "cpp", "triton" or "torch".
 
     Attributes:
-        view_motions: How the scene stood in each measured view against where the geometry has it; None: as it has it.
+        view_motions: Motion of the scene in each measured view relative to the geometry; None: no motion.
 
     >>> import trimesh
     >>> from torchkcreg.deformation import RigidDeformation
@@ -69,33 +69,38 @@ class Scene(nn.Module):
         self.intensity = IdentityIntensity() if intensity is None else intensity
         self.view_motions: ViewMotions | None = None
         self.metals, self.backend = list(metals), backend
-        own = [a.material for a in assemblies]
+        implant_materials = [a.material for a in assemblies]
         parts = [c.material for a in assemblies for c in a.components]
-        self.materials = list(dict.fromkeys([*own, *metals, *parts])) if materials is None else list(materials)
-        if missing := {*own, *metals, *parts} - set(self.materials):
+        self.materials = (
+            list(dict.fromkeys([*implant_materials, *metals, *parts])) if materials is None else list(materials)
+        )
+        if missing := {*implant_materials, *metals, *parts} - set(self.materials):
             raise ValueError(f"materials must hold all that the scene is made of, got none of {', '.join(missing)}")
 
     def __iter__(self) -> Iterator[Assembly]:
         return iter(self.assemblies)
 
     def view(self, data: RegistrationData | ConeBeamGeometry, **scale: Any) -> View:
-        """What is seen of the scene near its present state; see :class:`View` for ``scale``.
+        """View of the scene near its present state; see `View` for `scale`.
 
-        Measured images are seen as the scene stood in each of their views; a geometry alone is taken as it is.
+        With measured images the geometry is corrected by the view motions; a geometry alone is used unchanged.
         """
         if self.view_motions is not None and isinstance(data, RegistrationData):
             data = replace(data, geometry=self.view_motions.corrected(data.geometry))
         return View(list(self.assemblies), self.materials, data, backend=self.backend, **scale)
 
     def state(self, view: View) -> State:
-        """The scene as it is, as one candidate."""
+        """The scene's present state, as one candidate."""
         placements = [a.placement(nodes) for a, nodes in zip(self.assemblies, view.nodes, strict=True)]
-        return State(tuple(placements), self.intensity.arguments(view.pixel_px))
+        physics = {
+            free.attribute: getattr(self.intensity, free.attribute)[None] for free in self.intensity.free.values()
+        }
+        return State(tuple(placements), self.intensity.arguments(view.pixel_px, **physics))
 
     def path_lengths(self, view: View | ConeBeamGeometry, state: State | None = None) -> Tensor:
-        """Path lengths (K, M, V, rows, cols) on the view's rendered pixels, mm; K is 1 for the scene as it is.
+        """Path lengths (K, M, V, rows, cols) on the view's rendered pixels, mm; K is 1 for the present state.
 
-        Where the intensity model knows a background, it is the last of the materials.
+        If the intensity model has a background, it is the last material.
         """
         view = self.view(view) if isinstance(view, ConeBeamGeometry) else view
         state = self.state(view) if state is None else state
@@ -109,11 +114,11 @@ class Scene(nn.Module):
         return torch.stack(paths, dim=-4)
 
     def forward(self, view: View | ConeBeamGeometry, state: State | None = None) -> Tensor:
-        """Line integrals (K, V, rows, cols) of candidates; of the scene as it is, (V, rows, cols).
+        """Line integrals (K, V, rows, cols) of candidates, or (V, rows, cols) of the present state.
 
         Args:
-            view: See :meth:`view`; or a geometry, seen whole.
-            state: Candidates; the scene as it is when None.
+            view: See `view`; or a geometry, rendered whole.
+            state: Candidates; the present state when None.
         """
         view = self.view(view) if isinstance(view, ConeBeamGeometry) else view
         candidates = self.state(view) if state is None else state
@@ -125,19 +130,19 @@ class Scene(nn.Module):
         return lines[0] if state is None else lines
 
     def arguments(self, view: View, state: State) -> dict[str, Any]:
-        """Keyword arguments of the intensity model for candidates as a view has them."""
+        """Keyword arguments of the intensity model for the candidates in a view."""
         physics = dict(state.physics)
         if view.data is not None and view.data.scatter_shapes is not None and self.intensity.has_background:
             physics["scatter_shapes"] = view.data.scatter_shapes
         return physics | self.intensity.of_sources(view.geometry.sources)
 
     def without_components(self, assembly: Assembly) -> Scene:
-        """The scene with one of its implants alone, without what is fixed to it; it shares everything else."""
+        """The scene with one implant stripped of its components; all else is shared."""
         assemblies = [a.bare() if a is assembly else a for a in self.assemblies]
         return Scene(assemblies, self.intensity, metals=self.metals, materials=self.materials, backend=self.backend)
 
     def kept(self) -> dict[str, Any]:
-        """A copy of what a registration changes, as tensors and plain types, for :meth:`restore` and checkpoints."""
+        """Copy of all that a registration changes, as tensors and plain types, for `restore` and checkpoints."""
         return {
             "assemblies": [assembly.kept() for assembly in self.assemblies],
             "intensity": {name: value.detach().clone() for name, value in self.intensity.named_parameters()},
@@ -146,7 +151,7 @@ class Scene(nn.Module):
 
     @torch.no_grad()
     def restore(self, kept: dict[str, Any]) -> None:
-        """Goes back to what :meth:`kept` gave."""
+        """Restore a state that `kept` returned."""
         for assembly, state in zip(self.assemblies, kept["assemblies"], strict=True):
             assembly.restore(state)
         for name, value in self.intensity.named_parameters():
@@ -155,9 +160,9 @@ class Scene(nn.Module):
         self.view_motions = None if views is None else ViewMotions.of_kept(views)
 
     def description(self) -> dict[str, list[float]]:
-        """What tells a registration of this scene from one of another, as plain numbers."""
-        found: dict[str, list[float]] = {"the intensity model": [len(list(self.intensity.parameters()))]}
+        """Numbers that identify the scene, to check that a checkpoint belongs to it."""
+        numbers_of: dict[str, list[float]] = {"the intensity model": [len(list(self.intensity.parameters()))]}
         for assembly in self.assemblies:
             named = "" if len(self.assemblies) == 1 else f" of {assembly.name}"
-            found |= {f"{text}{named}": numbers for text, numbers in assembly.description().items()}
-        return found
+            numbers_of |= {f"{text}{named}": numbers for text, numbers in assembly.description().items()}
+        return numbers_of

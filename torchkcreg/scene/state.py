@@ -1,4 +1,4 @@
-"""What a rendered picture depends on: where implants and components are, and the parameters of the intensity."""
+"""Candidate states of a scene: positions of implants and components, and parameters of the intensity model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Placement:
-    """Where K candidates have an implant and what is fixed to it.
+    """Positions of an implant and its components in K candidates.
 
     Attributes:
         nodes: World positions (K, N, 3) of the implant's nodes, mm.
@@ -23,12 +23,12 @@ class Placement:
 
 @dataclass(frozen=True)
 class State:
-    """K candidates of a scene.
+    """K candidate states of a scene.
 
     Attributes:
-        placements: Of each assembly, in the scene's order.
-        physics: Arguments of the intensity model, each of shape (K,), the blur in the rendered pixels.
-        added: What is added to the path lengths of a material, by its name, (K, V, rows, cols), mm.
+        placements: Placement of each assembly, in the scene's order.
+        physics: Arguments of the intensity model, each of shape (K,), the blur in rendered pixels.
+        added: Path lengths (K, V, rows, cols) added to a material, by its name, mm.
         views: Motions (K, V, 4, 4) of the world before it is projected in each view; none when None.
     """
 

@@ -1,4 +1,4 @@
-"""What a stage sees: images of a scale around the implants, and the nodes that are rendered at it, made once."""
+"""Images at the resolution of a stage, cropped to the implants, and the nodes rendered on them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .state import Placement
 
 @dataclass(frozen=True)
 class _Body:
-    """Nodes of one material in one assembly: the implant's, if it is of it, then those of components."""
+    """Nodes of one material in one assembly: the implant's, if made of it, then those of components."""
 
     material: int
     assembly: int
@@ -35,25 +35,25 @@ class _Body:
 
 
 class View:
-    """The pixels on which a scene is rendered and compared, and how its nodes appear there.
+    """Pixels on which a scene is rendered and compared, and the nodes that are rendered.
 
     Args:
-        assemblies: In their present state, near which they will be rendered.
+        assemblies: Assemblies near the states that will be rendered.
         materials: Names in the order of the path lengths.
         data: Measured images, or a geometry alone.
         bin: Detector pixels are averaged in squares of this side.
         oversampling: Path lengths are rendered on pixels this many times finer and averaged as intensities: the mean of
             exponentials is not the exponential of the mean.
         pitch_factor: The implants' nodes are merged on a lattice this many times coarser.
-        margin_mm: What is seen around the implants' projection, mm at the detector; None: the whole detector.
-        backend: Of the projector.
+        margin_mm: Margin around the implants' projection, mm at the detector; None: the whole detector.
+        backend: Projector.
 
     Attributes:
         data: The images at this scale; None for a geometry alone.
-        geometry: Their views.
-        fine: The views on the rendered pixels.
-        pixel_px: Edge of a rendered pixel, in the detector's.
-        nodes: Nodes (N, 3) of each assembly that are rendered, in its implant's frame.
+        geometry: The views at this scale.
+        fine: The views with the finer pixels that are rendered.
+        pixel_px: Edge of a rendered pixel in detector pixels.
+        nodes: Rendered nodes (N, 3) of each assembly, in its implant's frame.
     """
 
     def __init__(
@@ -82,8 +82,8 @@ class View:
             seen = [placed.nodes[0] for placed in placements]
             seen += [
                 transform_points(motion, cloud.points.double()).to(self.dtype)
-                for placed, own in zip(placements, parts, strict=True)
-                for motion, cloud in zip(placed.components[0], own, strict=True)
+                for placed, clouds_of_parts in zip(placements, parts, strict=True)
+                for motion, cloud in zip(placed.components[0], clouds_of_parts, strict=True)
             ]
             self.data = self.data.windowed(torch.cat(seen), margin_mm / self.geometry.pixel_spacing[1])
             self.geometry = self.data.geometry
@@ -110,15 +110,15 @@ class View:
         parts: Sequence[ImplantPointCloud],
         placed: Placement,
     ) -> _Body | None:
-        own = assembly.material == material
+        holds_implant = assembly.material == material
         members = [j for j, component in enumerate(assembly.components) if component.material == material]
-        if not own and not members:
+        if not holds_implant and not members:
             return None
-        volumes = torch.cat([c.volumes for c in [*([cloud] if own else []), *(parts[j] for j in members)]])
+        volumes = torch.cat([c.volumes for c in [*([cloud] if holds_implant else []), *(parts[j] for j in members)]])
         nodes = [(j, parts[j].points.to(self.dtype)) for j in members]
-        cell = cloud.cell.to(self.dtype) @ assembly.implant_to_world[:3, :3].to(self.dtype).T
-        footprint = cell_footprint(_points(placed, own, nodes)[0], cell, self.matrices)
-        return _Body(index, number, own, nodes, volumes.to(self.dtype), footprint)
+        cell = cloud.cell.to(self.dtype) @ assembly.implant_to_world.detach()[:3, :3].to(self.dtype).T
+        footprint = cell_footprint(_points(placed, holds_implant, nodes)[0], cell, self.matrices)
+        return _Body(index, number, holds_implant, nodes, volumes.to(self.dtype), footprint)
 
     def _following(self) -> FollowingBackground | None:
         data = self.data
@@ -132,7 +132,7 @@ class View:
         """The measured images.
 
         Raises:
-            ValueError: If there are none, only a geometry.
+            ValueError: If the view has only a geometry.
         """
         if self.data is None:
             raise ValueError("the view has a geometry alone, and no measured images to compare with")
@@ -140,7 +140,7 @@ class View:
 
     @property
     def num_nodes(self) -> int:
-        """Nodes of all materials."""
+        """Number of nodes of all materials."""
         return sum(len(body.volumes) for body in self.bodies)
 
     def path_lengths(
@@ -149,8 +149,8 @@ class View:
         """Path lengths (K, V, rows, cols) of each material on the rendered pixels, mm.
 
         Args:
-            placements: Of K candidates, of each assembly.
-            num_materials: How many there are.
+            placements: Placement of each assembly, for K candidates.
+            num_materials: Number of materials.
             views: Motions (K, V, 4, 4) of the world before it is projected in each view.
         """
         shape = (len(placements[0].nodes), len(self.matrices), *self.fine.det_shape)
@@ -167,7 +167,7 @@ class View:
             return self._projected(body, points, slice(None))
         if not views.requires_grad and bool((views == views[:1]).all()):  # the same for all candidates
             return self._projected(body, points, slice(None), self.matrices @ views[0].to(self.matrices))
-        alone = [  # what moves otherwise in every view is projected view by view
+        alone = [  # motions that differ between views are projected view by view
             self._projected(body, transform_points(motion.to(points), points), slice(view, view + 1))
             for view, motion in enumerate(views.unbind(1))
         ]

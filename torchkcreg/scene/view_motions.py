@@ -1,4 +1,4 @@
-"""How a limb stood in each view against where the geometry has it: detectors sag, sources wander, patients move."""
+"""Motion of the limb in each view relative to the geometry: detectors sag, sources wander, patients move."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torchkcreg.geometry import ConeBeamGeometry, rigid_matrix, rotation_about
 from torchkcreg.optimization.parameters import ParameterBlock
 from torchkcreg.precision import ExactModule
 
-_BESIDE_IMAGES = 30.0  # of the loss that a standard deviation of the images is worth
+_BESIDE_IMAGES = 30.0  # times the loss of one standard deviation of the images
 
 
 class ViewMotions(ExactModule):
-    """A small rigid motion of the world for each view, before it is projected: ``P_v T_v``.
+    """A small rigid motion of the world for each view, before it is projected: `P_v T_v`.
 
-    A detector's offset and a source's are, but for a trace of perspective, such motions too. What all views have in
-    common is the implants' pose; the prior leaves it there.
+    An offset of detector or source is, up to a little perspective, such a motion too. A motion common to all views
+    belongs to the implants' pose; the prior keeps it there.
 
     Args:
-        nodes: World positions (N, 3) about whose middle the motions turn, mm.
-        num_views: V.
-        likely_mm: Standard deviation of a translation along each axis, and of a rotation about each as what it moves
-            nodes by, root mean square.
+        nodes: World positions (N, 3), mm; the motions rotate about their mean.
+        num_views: Number of views V.
+        likely_mm: Standard deviation of the translation along each axis, and of the rotation about each axis as root
+            mean square displacement of the nodes.
 
     Attributes:
         values: Buffer (V, 6): rotations, as mm at the nodes' radius of gyration, and translations, mm; world axes.
-        weight: Buffer: loss for a value that is a standard deviation.
+        weight: Buffer: loss for a value of one standard deviation.
     """
 
     exact_buffers: ClassVar[tuple[str, ...]] = ("values", "weight", "center", "radius")
@@ -47,33 +47,33 @@ class ViewMotions(ExactModule):
         self.register_buffer("weight", nodes.new_tensor(1e-6))
 
     def kept(self) -> dict[str, Any]:
-        """A copy of what it is, as tensors and plain types, for :meth:`of_kept`."""
+        """Copy of the state, as tensors and plain types, for `of_kept`."""
         return {"likely_mm": self.likely_mm, **{name: getattr(self, name).clone() for name in self.exact_buffers}}
 
     @classmethod
     def of_kept(cls, kept: dict[str, Any]) -> ViewMotions:
-        """What :meth:`kept` gave."""
+        """The motions that `kept` copied."""
         motions = cls(kept["center"][None], len(kept["values"]), kept["likely_mm"])
         for name in cls.exact_buffers:
             getattr(motions, name).copy_(kept[name])
         return motions
 
     def matrices(self, values: Tensor | None = None) -> Tensor:
-        """Rigid motions (..., V, 4, 4) of values (..., V, 6); the present ones when None."""
+        """Rigid motions (..., V, 4, 4) of values (..., V, 6); of the present values when None."""
         values = self.values if values is None else values
         turned, shifted = values[..., :3] / self.radius, values[..., 3:]
         return rigid_matrix(torch.zeros_like(shifted), shifted) @ rotation_about(self.center, turned)
 
     @property
     def rms_mm(self) -> float:
-        """How far the motions move nodes, root mean square over the views."""
+        """Displacement of the nodes, root mean square over the views."""
         return float(self.values.square().sum(-1).mean().sqrt())
 
     def corrected(self, geometry: ConeBeamGeometry) -> ConeBeamGeometry:
-        """The geometry of the V views as they really were.
+        """The geometry of the V views with the motions applied.
 
         Raises:
-            ValueError: If it has another number of views.
+            ValueError: If the geometry has another number of views.
         """
         if geometry.num_views != self.num_views:
             raise ValueError(f"motions of {self.num_views} views do not fit a geometry of {geometry.num_views}")
@@ -81,10 +81,10 @@ class ViewMotions(ExactModule):
 
 
 class ViewMotionSteps(ParameterBlock):
-    """Steps of the motions of views, mm, from where they are.
+    """Steps of the view motions from their present values, mm.
 
     Args:
-        motions: Whose values change.
+        motions: The motions that the steps change.
     """
 
     def __init__(self, motions: ViewMotions) -> None:
@@ -98,10 +98,10 @@ class ViewMotionSteps(ParameterBlock):
         return float(self.motions_of_views.weight)
 
     def weigh(self, loss: float) -> None:
-        """The prior counts more than the images do.
+        """Set the prior's weight to a multiple of the images' loss per standard deviation.
 
-        Views that are at odds with each other tell of a motion by far more than that. Motions that they agree on are
-        told by magnification alone, which a model whose edges are off by a tenth of a pixel has wrong.
+        Motions by which views contradict each other show far more strongly than this prior. Motions common to all views
+        show by magnification alone, which is wrong if the model's edges are off by a tenth of a pixel.
         """
         self.motions_of_views.weight.fill_(_BESIDE_IMAGES * loss)
 
@@ -110,15 +110,15 @@ class ViewMotionSteps(ParameterBlock):
         return self.start + steps.unflatten(-1, (-1, 6))
 
     def motions(self, steps: Tensor) -> Tensor:
-        """Motions (K, V, 4, 4) that steps (K, D) add to the present ones, before these."""
+        """Motions (K, V, 4, 4) that steps (K, D) add, applied before the present ones."""
         return self._back @ self.motions_of_views.matrices(self.values(steps))
 
     def penalty(self, steps: Tensor) -> Tensor:
-        """Squared values (K,) in standard deviations, weighted."""
+        """Weighted squared values (K,), in standard deviations."""
         deviations = self.values(steps) / self.motions_of_views.likely_mm
         return self.motions_of_views.weight * deviations.square().sum((-2, -1))
 
     @torch.no_grad()
     def accept(self, steps: Tensor) -> None:
-        """Moves the views by steps (D,)."""
+        """Move the views by steps (D,)."""
         self.motions_of_views.values.copy_(self.values(steps[None])[0])

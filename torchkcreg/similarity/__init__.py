@@ -1,5 +1,6 @@
-"""How alike a rendered and a measured radiograph are: gradient correlation, normalised cross-correlation, and the
-Sobel derivatives under them, all of whole batches of candidates at once.
+"""Similarity of rendered and measured radiographs, for whole batches of candidates.
+
+Gradient correlation, gradient difference and normalised cross-correlation, and the Sobel derivatives they are based on.
 """
 
 from .gradient_correlation import GradientCorrelation, GradientCorrelationLoss, GradientDifference, gradient_correlation

@@ -1,4 +1,4 @@
-"""Gradient correlation (GC), the similarity of eq. 4 of Cao et al. (2020)."""
+"""Gradient correlation (GC), the similarity of eq. 4 of Cao et al. (2020), and gradient difference (GD)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .ncc import largest_value, unit_contrast
 from .similarity import Similarity
 from .sobel import erode_mask, sobel_gradient
 
-# Pixels worked on at once on a CPU. Candidates beyond that follow in the next block: its buffers then stay in cache,
-# where a whole population's would be fetched from (and given back to) the operating system in every pass.
+# Pixels per block on a CPU; larger batches are processed in several blocks. The buffers of a block stay in cache, while
+# those of a whole population would be allocated from the operating system and freed in every pass.
 _PIXELS_PER_BLOCK = 2**18
 
 
@@ -23,20 +23,21 @@ _PIXELS_PER_BLOCK = 2**18
 def gradient_correlation(moving: Tensor, fixed: Tensor, *, mask: Tensor | None = None) -> Tensor:
     """Gradient correlation of each view, 1 for a perfect match (eq. 4 of Cao et al. 2020).
 
-    GC = (NCC(d_u moving, d_u fixed) + NCC(d_v moving, d_v fixed)) / 2 with Sobel derivatives and NCC's means over the
-    mask. GC(a x + b) = GC(x) for a > 0. A flat derivative image contributes 0, with zero gradient, never NaN.
+    GC = (NCC(d_u moving, d_u fixed) + NCC(d_v moving, d_v fixed)) / 2 with Sobel derivatives. Means and sums of the NCC
+    run over the mask. GC(a x + b) = GC(x) for a > 0. A flat derivative image contributes 0, with zero gradient, never
+    NaN.
 
     Args:
-        moving: rendered images, shape (..., V, rows, cols).
-        fixed: measured images, shape (V, rows, cols) or with leading axes that broadcast against those of `moving`.
-        mask: shape (V, rows, cols), nonzero where pixels count. It is eroded by 3 x 3 pixels, so what masked pixels
-            hold (NaN included) never enters. None counts all.
+        moving: Rendered images, shape (..., V, rows, cols).
+        fixed: Measured images, shape (V, rows, cols) or with leading axes that broadcast against those of `moving`.
+        mask: Shape (V, rows, cols), nonzero where pixels are used. It is eroded by 3 x 3 pixels, so values of masked
+            pixels (NaN included) never enter. None uses all pixels.
 
     Returns:
         Tensor of shape (..., V), differentiable in both images.
 
     Raises:
-        ValueError: if shapes do not fit.
+        ValueError: If shapes do not match.
 
     Example:
         >>> x = torch.rand(2, 16, 16)
@@ -53,10 +54,12 @@ def gradient_correlation(moving: Tensor, fixed: Tensor, *, mask: Tensor | None =
 
 
 class OfGradients(Similarity):
-    """What similarities of gradients know of the measured images: which pixels count, and the gradients there.
+    """Base class of gradient similarities: stores masks, weights and gradients of the measured images.
 
     Args:
-        fixed, mask, weights: see `GradientCorrelation`.
+        fixed: Measured images, see `GradientCorrelation`.
+        mask: See `GradientCorrelation`.
+        weights: See `GradientCorrelation`.
     """
 
     unit_gradients: Tensor
@@ -75,26 +78,26 @@ class OfGradients(Similarity):
         return self.unit_gradients.shape[0]
 
     def in_blocks(self, function: Callable[[Tensor], Tensor], moving: Tensor) -> Tensor:
-        """`function` of rendered images (..., V, rows, cols), checked against the measured ones."""
+        """Apply `function` to rendered images (..., V, rows, cols) in blocks, after a check of their shape."""
         check_images(moving, self.unit_gradients[:, 0])
         return in_blocks(function, moving)
 
 
 class GradientCorrelation(OfGradients):
-    """Gradient correlation with measured images whose side of the work is done once.
+    """Gradient correlation with fixed measured images, whose gradients are computed once.
 
     Args:
-        fixed: measured images, shape (V, rows, cols), finite where they count.
-        mask: shape (V, rows, cols), nonzero where pixels count, see `gradient_correlation`.
-        weights: shape (V, rows, cols), how much a pixel counts in means and sums, not negative; all alike if None.
+        fixed: Measured images, shape (V, rows, cols), finite inside the mask.
+        mask: Shape (V, rows, cols), nonzero where pixels are used, see `gradient_correlation`.
+        weights: Weights of the pixels in means and sums, shape (V, rows, cols), not negative. None: all equal.
 
     Raises:
-        ValueError: if shapes do not fit, weights are negative, or `fixed` is not finite at a pixel that counts.
+        ValueError: If shapes do not match, weights are negative, or `fixed` is not finite inside the mask.
 
     Attributes:
-        unit_gradients: buffer (V, 2, rows, cols), the fixed derivatives with mean 0 and norm 1 over the mask.
-        mask: boolean buffer (V, rows, cols) or None.
-        eroded_mask: buffer (V, rows, cols) or None, how much each pixel's derivatives count.
+        unit_gradients: Buffer (V, 2, rows, cols), derivatives of `fixed` with mean 0 and norm 1 over the mask.
+        mask: Boolean buffer (V, rows, cols) or None.
+        eroded_mask: Buffer (V, rows, cols) or None, weight of each pixel's derivatives.
 
     Example:
         >>> x = torch.rand(3, 16, 16)
@@ -113,14 +116,14 @@ class GradientCorrelation(OfGradients):
         return self.in_blocks(lambda b: _correlate(b, self.unit_gradients, self.mask, self.eroded_mask), moving)
 
     def residuals(self, moving: Tensor) -> Tensor:
-        """Differences of the unit gradients of `moving` and of the fixed images, for least-squares methods.
+        """Differences between the unit gradients of `moving` and of the fixed images, for least-squares methods.
 
-        Since 1 - NCC(a, b) = |a/|a| - b/|b||^2 / 2 for images without their means, their squares sum to the loss:
-        1 - GC = sum residuals^2 / 4 over (2, rows, cols). Where `moving` is flat (NCC 0) the fixed unit gradients,
-        scaled to keep this true, are the residual. A fixed view that is flat has nothing to say: its residuals are 0.
+        Since 1 - NCC(a, b) = |a/|a| - b/|b||^2 / 2 for images without their means, the squares sum to the loss:
+        1 - GC = sum residuals^2 / 4 over (2, rows, cols). Where `moving` is flat (NCC 0) the residuals are the fixed
+        unit gradients, scaled so that this still holds. A flat fixed view carries no information: its residuals are 0.
 
         Args:
-            moving: rendered images, shape (..., V, rows, cols).
+            moving: Rendered images, shape (..., V, rows, cols).
 
         Returns:
             Tensor of shape (..., V, 2, rows, cols).
@@ -137,11 +140,11 @@ class GradientCorrelation(OfGradients):
 
 
 class GradientCorrelationLoss(nn.Module):
-    """1 - GC averaged over the views: falls as the match gets better, 0 at its best, 2 at its worst.
+    """Mean of 1 - GC over the views: 0 for a perfect match, 2 at worst.
 
     Args:
-        fixed: measured images, shape (V, rows, cols).
-        mask: shape (V, rows, cols), nonzero where pixels count, see `gradient_correlation`.
+        fixed: Measured images, shape (V, rows, cols).
+        mask: Shape (V, rows, cols), nonzero where pixels are used, see `gradient_correlation`.
 
     Example:
         >>> x = torch.rand(3, 16, 16)
@@ -173,7 +176,7 @@ def _unit_gradients(images: Tensor, mask: Tensor | None, eroded: Tensor | None) 
 def _weights_of_pixels(
     fixed: Tensor, mask: Tensor | None, weights: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None]:
-    """The mask as booleans, and how much each pixel's derivatives count, checked against the fixed images."""
+    """Boolean mask and the weight of each pixel's derivatives, checked against the fixed images."""
     if fixed.ndim != 3:
         raise ValueError(f"fixed must have shape (V, rows, cols), got {tuple(fixed.shape)}")
     if mask is not None:
@@ -193,7 +196,7 @@ def _weights_of_pixels(
 
 
 def in_blocks(function: Callable[[Tensor], Tensor], moving: Tensor, *, whole: bool = False) -> Tensor:
-    """`function` of (K, V, rows, cols) images, a few candidates at a time, with the leading axes put back."""
+    """Apply `function` to (K, V, rows, cols) images, a few candidates at a time, and restore the leading axes."""
     if whole or moving.device.type != "cpu" or moving.numel() <= _PIXELS_PER_BLOCK:
         return function(moving)
     flat = moving.reshape(-1, *moving.shape[-3:])
@@ -203,7 +206,7 @@ def in_blocks(function: Callable[[Tensor], Tensor], moving: Tensor, *, whole: bo
 
 
 def check_images(moving: Tensor, fixed: Tensor) -> None:
-    """Raises ValueError unless images agree in (V, rows, cols)."""
+    """Raise ValueError unless images agree in (V, rows, cols)."""
     if fixed.ndim < 3 or moving.ndim < 3 or moving.shape[-3:] != fixed.shape[-3:]:
         raise ValueError(
             f"moving and fixed must agree in (V, rows, cols), got {tuple(moving.shape)} and {tuple(fixed.shape)}"
@@ -216,19 +219,20 @@ def _check_mask(mask: Tensor, fixed: Tensor) -> None:
 
 
 class GradientDifference(OfGradients):
-    """How near the gradients of rendered images come to those of measured ones, 1 for a perfect match.
+    """Gradient difference (GD): closeness of rendered and measured gradients, 1 for a perfect match.
 
-    ``GD = 1 - sum_d |d y - d y*|^2 / (4 |d y*|^2)`` over the Sobel derivatives d along u and v, their means taken out.
-    Near a match it agrees with gradient correlation (eq. 4 of Cao et al. 2020), to which a factor of the contrast means
-    nothing; here a contrast that is off costs. So scatter, which lowers it, and hardness can be told apart from motion.
+    `GD = 1 - sum_d |d y - d y*|^2 / (4 |d y*|^2)` over the Sobel derivatives d along u and v, without their means.
+    Near a match it agrees with gradient correlation (eq. 4 of Cao et al. 2020). Gradient correlation ignores a factor
+    of the contrast; here a wrong contrast lowers the similarity. So scatter (which lowers contrast) and hardness can be
+    distinguished from motion.
 
     Args:
-        fixed: Measured images, shape (V, rows, cols), finite where they count.
-        mask: Shape (V, rows, cols), nonzero where pixels count; it is eroded by 3 x 3 pixels.
-        weights: Shape (V, rows, cols), how much a pixel counts, not negative; all alike if None.
+        fixed: Measured images, shape (V, rows, cols), finite inside the mask.
+        mask: Shape (V, rows, cols), nonzero where pixels are used. It is eroded by 3 x 3 pixels.
+        weights: Weights of the pixels, shape (V, rows, cols), not negative. None: all equal.
 
     Raises:
-        ValueError: If shapes do not fit, weights are negative, or ``fixed`` is not finite at a pixel that counts.
+        ValueError: If shapes do not match, weights are negative, or `fixed` is not finite inside the mask.
 
     >>> x = torch.rand(3, 16, 16)
     >>> GradientDifference(x)(torch.stack([x + 1, 0 * x])).round(decimals=3).tolist()
@@ -251,14 +255,14 @@ class GradientDifference(OfGradients):
         return self.in_blocks(lambda block: 1 - 0.25 * self._residuals(block).square().sum((-3, -2, -1)), moving)
 
     def residuals(self, moving: Tensor) -> Tensor:
-        """Differences of the gradients (..., V, 2, rows, cols), whose squares sum to 4 (1 - GD)."""
+        """Normalised gradient differences (..., V, 2, rows, cols), whose squares sum to 4 (1 - GD)."""
         return self.in_blocks(self._residuals, moving)
 
     def _residuals(self, moving: Tensor) -> Tensor:
         return self._contrast(moving) * self.inverse_norms - self.unit_gradients
 
     def _contrast(self, images: Tensor) -> Tensor:
-        """Derivatives (..., V, 2, rows, cols) without their weighted means, times the roots of the weights."""
+        """Derivatives (..., V, 2, rows, cols) minus their weighted means, times the square roots of the weights."""
         if self.mask is not None:
             images = torch.where(self.mask, images, 0.0)
         gradients = sobel_gradient(images)

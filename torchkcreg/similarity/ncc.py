@@ -1,4 +1,4 @@
-"""Normalised cross-correlation that knows what a flat image is."""
+"""Normalised cross-correlation, with flat images handled explicitly."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from torch import Tensor
 
 from torchkcreg.precision import full_precision
 
-# An image counts as flat when its RMS contrast is below this many rounding errors of its largest value: what is left
-# is then noise of the arithmetic. Relative, so that it does not matter whether values are 1e-3 or 20.
+# An image counts as flat when its RMS contrast is below this many rounding errors of its largest value: what remains
+# is rounding noise. The threshold is relative, so it does not depend on the scale of the values.
 _FLAT_ROUNDINGS = 16.0
 
 
 @full_precision
 def normalized_cross_correlation(a: Tensor, b: Tensor, *, mask: Tensor | None = None) -> Tensor:
-    """Normalised cross-correlation of each pair of images over its mask: 1 for a perfect match, -1 for the opposite.
+    """Normalised cross-correlation of each pair of images over its mask: 1 for a perfect match, -1 for an inverted one.
 
     NCC = sum (a - mean a)(b - mean b) / sqrt(sum (a - mean a)^2 sum (b - mean b)^2), sums and means over the mask.
-    A flat image (no contrast beyond rounding, or no pixel that counts) gives 0, and zero gradients.
+    A flat image (no contrast beyond rounding, or empty mask) gives 0, with zero gradients.
 
     Args:
-        a: images, shape (..., rows, cols).
-        b: images that broadcast against `a`.
-        mask: shape (..., rows, cols), broadcastable, nonzero where pixels count. What masked pixels hold
-            (NaN included) does not matter. None counts all.
+        a: Images, shape (..., rows, cols).
+        b: Images that broadcast against `a`.
+        mask: Shape (..., rows, cols), broadcastable, nonzero where pixels are used. Values of masked pixels
+            (NaN included) never enter. None uses all pixels.
 
     Returns:
         Correlations of shape (...).
 
     Raises:
-        ValueError: if the images or the mask have different (rows, cols).
+        ValueError: If the images or the mask have different (rows, cols).
 
     Example:
         >>> a = torch.rand(2, 8, 8)
@@ -46,13 +46,13 @@ def normalized_cross_correlation(a: Tensor, b: Tensor, *, mask: Tensor | None = 
 
 
 def unit_contrast(images: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
-    """Images minus their weighted mean, times the roots of the weights, scaled to norm 1; all zero if flat.
+    """Images minus their weighted mean, times the square roots of the weights, scaled to norm 1; all zero if flat.
 
     Args:
-        images: shape (..., rows, cols), finite.
-        mask: weights of the pixels, broadcastable to `images`, not negative, or None for all alike.
-        scale: shape (...), the size of the values that `images` were computed from: contrast below
-            16 rounding errors of it is noise, and the image flat.
+        images: Shape (..., rows, cols), finite.
+        mask: Weights of the pixels, broadcastable to `images`, not negative. None: all equal.
+        scale: Shape (...), the magnitude of the values that `images` were computed from. Images whose contrast is below
+            16 rounding errors of it count as flat.
 
     Returns:
         Tensor of the shape of `images`. Its gradients are finite everywhere, and zero for flat images.
@@ -78,6 +78,6 @@ def largest_value(images: Tensor) -> Tensor:
     return torch.linalg.vector_norm(images.detach(), float("inf"), dim=(-2, -1))
 
 
-def _check_same_size(a: Tensor, other: Tensor, name: str) -> None:
-    if a.shape[-2:] != other.shape[-2:]:
-        raise ValueError(f"{name} must have (rows, cols) = {tuple(a.shape[-2:])}, got shape {tuple(other.shape)}")
+def _check_same_size(a: Tensor, image: Tensor, name: str) -> None:
+    if a.shape[-2:] != image.shape[-2:]:
+        raise ValueError(f"{name} must have (rows, cols) = {tuple(a.shape[-2:])}, got shape {tuple(image.shape)}")

@@ -1,4 +1,4 @@
-"""What a registration asks of a similarity."""
+"""Interface of the similarities that a registration can use."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from torch import Tensor, nn
 
 
 class Similarity(nn.Module, ABC):
-    """How alike rendered and measured images are: 1 for a perfect match, less for others.
+    """Similarity of rendered and measured images: 1 for a perfect match, less otherwise.
 
-    A similarity of your own derives from it, keeps what it needs of the measured images, and is given to a registration
-    as a class or as anything else that makes one of ``(fixed, mask, weights)``.
+    For your own similarity, derive a class that stores what it needs of the measured images. Pass a registration the
+    class, or any callable that returns an instance from `(fixed, mask, weights)`.
 
     Args:
         fixed: Measured images, shape (V, rows, cols).
-        mask: Shape (V, rows, cols), nonzero where pixels count; None: all do.
-        weights: Shape (V, rows, cols), how much a pixel counts, not negative; None: all alike.
+        mask: Shape (V, rows, cols), nonzero where pixels are used. None uses all pixels.
+        weights: Weights of the pixels, shape (V, rows, cols), not negative. None: all equal.
     """
 
     @abstractmethod
@@ -27,8 +27,8 @@ class Similarity(nn.Module, ABC):
         """Residuals (..., V, channels, rows, cols) whose squares sum to 4 (1 - similarity), for least squares.
 
         Raises:
-            NotImplementedError: If the similarity is no sum of squares.
+            NotImplementedError: If the similarity is not a sum of squares.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} is no sum of squares, which Gauss-Newton and the weighting of pixels need"
+            f"{type(self).__name__} is not a sum of squares, which Gauss-Newton and the weighting of pixels need"
         )

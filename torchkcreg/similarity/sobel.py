@@ -1,4 +1,4 @@
-"""Sobel derivatives of images, and the mask of pixels whose derivatives can be trusted."""
+"""Sobel derivatives of images, and the mask of pixels with valid derivatives."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor
 from torchkcreg.kernels.differentiable import linear
 from torchkcreg.precision import full_precision
 
-# Adjoint kernels, (gradient image of u and v) -> image. Both Sobel kernels are odd: turned by 180 degrees, as an
-# adjoint asks, they only change sign.
+# Adjoint kernels, (gradient image of u and v) -> image. Both Sobel kernels are odd: the rotation by 180 degrees that an
+# adjoint needs only changes their sign.
 _ADJOINT_SOBEL = (
     ((0.125, 0.0, -0.125), (0.25, 0.0, -0.25), (0.125, 0.0, -0.125)),
     ((0.125, 0.25, 0.125), (0.0, 0.0, 0.0), (-0.125, -0.25, -0.125)),
@@ -23,16 +23,16 @@ def sobel_gradient(images: Tensor) -> Tensor:
     """Sobel derivatives of images in grey values per pixel, along u (columns) first, then along v (rows).
 
     The kernel is normalised (a ramp of slope 1 has derivative 1) and the border pixels are repeated outwards, both
-    as in `kornia.filters.spatial_gradient`, which does the work.
+    as in `kornia.filters.spatial_gradient`, which is used here.
 
     Args:
-        images: any leading axes, shape (..., rows, cols), floating point.
+        images: Shape (..., rows, cols) with any leading axes, floating point.
 
     Returns:
         Derivatives of shape (..., 2, rows, cols).
 
     Raises:
-        ValueError: if `images` has fewer than two axes, is empty or is not floating point.
+        ValueError: If `images` has fewer than two axes, is empty or is not floating point.
 
     Example:
         >>> ramp = torch.arange(5.0).expand(4, 5)
@@ -49,10 +49,10 @@ def sobel_gradient(images: Tensor) -> Tensor:
 
 
 def erode_mask(mask: Tensor) -> Tensor:
-    """Mask of the pixels whose 3 x 3 neighbourhood counts as a whole, so that no masked value enters a derivative.
+    """Mask of the pixels whose whole 3 x 3 neighbourhood is used, so that no masked value enters a derivative.
 
     Args:
-        mask: shape (..., rows, cols), nonzero where pixels count. The image's border itself masks nothing.
+        mask: Shape (..., rows, cols), nonzero where pixels are used. The image border does not mask anything.
 
     Returns:
         Boolean mask of the same shape.
@@ -69,11 +69,11 @@ def _sobel(images: Tensor) -> Tensor:
 def _adjoint(gradients: Tensor) -> Tensor:
     """Adjoint of `_sobel`: (B, 2, rows, cols) -> (B, 1, rows, cols), as a plain convolution.
 
-    Autograd's own adjoint is a transposed convolution, which on a CPU takes five to ten times as long.
+    The adjoint by autograd is a transposed convolution, which takes five to ten times as long on a CPU.
     """
     kernel = torch.tensor(_ADJOINT_SOBEL, dtype=gradients.dtype, device=gradients.device)[None]
     padded = F.conv2d(gradients, kernel, padding=2)
-    # Adjoint of repeating the border: what fell outside returns to the border pixel it was a copy of.
+    # Adjoint of repeating the border: values outside are added to the border pixel they are copies of.
     padded[..., 1, :] += padded[..., 0, :]
     padded[..., -2, :] += padded[..., -1, :]
     padded[..., :, 1] += padded[..., :, 0]

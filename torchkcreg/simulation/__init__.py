@@ -1,6 +1,6 @@
-"""Simulation of weight-bearing experiments: hardware, loads, the scanner, and whole cases with known truth.
+"""Simulation of weight-bearing experiments: hardware, loads, the scanner, and whole cases with ground truth.
 
-`weight_bearing_case` gives images of a loaded plate together with what really happened to it.
+`weight_bearing_case` returns images of a loaded plate together with its true deformation.
 """
 
 from .cases import SimulatedCase, weight_bearing_case

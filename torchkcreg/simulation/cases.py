@@ -1,4 +1,4 @@
-"""Weight-bearing cases with known truth: a plated bone under load in front of the multisource scanner."""
+"""Weight-bearing cases with ground truth: a plated bone under load in the multisource scanner."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ BEAD_RADIUS = 1.0
 BONE_OFFSET_Y = -17.0
 GAP = 4.0
 FRAGMENTS = ("distal", "proximal")
-SMALLEST_TISSUE_RADIUS = 30.0  # what it takes to hold plate and beads
+SMALLEST_TISSUE_RADIUS = 30.0  # smallest cylinder that contains plate and beads
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCase:
-    """A simulated weight-bearing experiment. The implant's frame is the world's, before the load.
+    """A simulated weight-bearing experiment. Before the load the implant's frame is the world's.
 
     Attributes:
         geometry: The views.
         implant: Mesh of the undeformed plate.
-        implant_material: Its material.
-        screws: Its screws, undeformed.
+        implant_material: Material of the plate.
+        screws: Screws of the undeformed plate.
         beads_before: Centres (8, 3) of the steel beads without load, mm.
-        beads_after: Where the load takes them: the truth.
-        deform: Maps points (..., 3) of the undeformed frame, nodes or beads, to where the load takes them.
+        beads_after: True centres (8, 3) of the beads under load, mm.
+        deform: Maps points (..., 3) of the undeformed frame, nodes or beads, to their loaded positions.
         intensity: Counts (V, rows, cols), uint16.
         open_beam: Counts of the unattenuated beam, without scatter.
         saturation: The largest count.
         spectrum: The detected spectrum.
-        load: What was done to the plate.
-        parts: What stood in the beam.
-        carried: What the plate carries, where that is known.
+        load: The load on the plate.
+        parts: Bodies in the beam.
+        carried: Load carried by the plate; None if it is not known.
     """
 
     geometry: ConeBeamGeometry
@@ -67,7 +67,7 @@ class SimulatedCase:
     carried: CarriedLoad | None = None
 
     def deformed_implant(self) -> trimesh.Trimesh:
-        """Mesh of the plate under load: the truth."""
+        """True mesh of the plate under load."""
         return mapped(self.implant, self.deform)
 
 
@@ -85,22 +85,22 @@ def weight_bearing_case(
 ) -> SimulatedCase:
     """A plated tibia under load: steel plate, screws, hollow bone with a gap, beads, three views.
 
-    A ten-hole plate of 188 x 13.5 x 4.6 mm stands along z with the bone 17 mm behind it (negative y); its screws, of
+    A ten-hole plate of 188 x 13.5 x 4.6 mm lies along z, with the bone 17 mm behind it (negative y). Its screws, of
     2 mm radius, hold the two fragments, which follow them rigidly. The plate is longer than the field of view of T1
     and T3.
 
     Args:
-        load: Between 0 (nothing happens, misalignment included) and 1 (3 degrees of bending, 1 of torsion and a
-            misalignment of about 1.5 mm and 1 degree that depends on the seed) or beyond; or a `Load` as it is.
+        load: Strength from 0 (no load and no misalignment) to 1 (3 degrees of bending, 1 of torsion and a
+            misalignment of about 1.5 mm and 1 degree that depends on the seed) or more; or a `Load`.
         seed: Seed of misalignment and noise.
         views: Views of `MultisourceScanner().geometry()`, whose index is their angle in degrees: (91, 92, 93) see the
             plate face on, (47, 48, 49) obliquely; each three have T1, T2, T3.
-        det_shape: Rows and columns of the part of the panel that is read, about its middle, before binning.
+        det_shape: Rows and columns of the central part of the panel that is read, before binning.
         binning: Pixels along each side that are binned into one.
         mode: `"axial"`: six screws, bending and torsion; `"s_bend"`: four outer screws, an S-bend and torsion.
         kvp: Tube voltage.
-        tissue_radius_mm: Radius of soft tissue around the bone's axis, 30 or more; none by default.
-        detector: The detector; the default one where None.
+        tissue_radius_mm: Radius of the soft tissue around the bone's axis, 30 or more; no tissue by default.
+        detector: Detector model; the default one if None.
 
     Raises:
         ValueError: If the mode is unknown, the panel smaller than `det_shape`, or the tissue too thin for the plate.
@@ -141,7 +141,7 @@ def weight_bearing_case(
 
 
 def _typical_load(load: float, mode: str, zone_mm: float, seed: int) -> Load:
-    """A load of the given strength whose misalignment depends on the seed."""
+    """Load of the given strength, with a misalignment that depends on the seed."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(2, 3))
     turn, shift = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -156,7 +156,7 @@ def _typical_load(load: float, mode: str, zone_mm: float, seed: int) -> Load:
 
 
 def _bead_positions() -> Tensor:
-    """Centres (8, 3) of two groups of beads beside the plate's ends, mm."""
+    """Centres (8, 3) of two groups of beads near the plate's ends, mm."""
     group = torch.tensor([[11.0, 3.0, 70.0], [-12.0, -2.0, 75.0], [10.0, -6.0, 82.0], [-10.0, 5.0, 88.0]]).double()
     return torch.cat([group * torch.tensor([1.0, 1.0, -1.0]), group * torch.tensor([-1.0, 1.0, 1.0])])
 
@@ -190,7 +190,7 @@ def _parts_in_beam(
 
 
 def fragment_at(height: float) -> str:
-    """The fragment of the bone at a height z in mm: distal below the gap, proximal above."""
+    """Name of the bone fragment at a height z in mm: distal below the gap, proximal above."""
     return FRAGMENTS[0] if height < 0 else FRAGMENTS[1]
 
 
@@ -200,7 +200,7 @@ def _bone_axis(*heights: float) -> Tensor:
 
 
 def _cropped(det_shape: tuple[int, int], binning: int) -> ConeBeamGeometry:
-    """The scanner's whole scan, its panel cropped to the middle and binned."""
+    """Geometry of the whole scan, with the panel cropped about its centre and binned."""
     scanner = MultisourceScanner()
     if not all(0 < size <= whole for size, whole in zip(det_shape, scanner.det_shape)):
         raise ValueError(f"det_shape must fit into the panel's {scanner.det_shape}, got {tuple(det_shape)}")

@@ -1,4 +1,4 @@
-"""What a random case is made of: plate, screws, limb, tube voltage, scanner and load, drawn by a seed."""
+"""Random parameters of a simulated case: plate, screws, limb, tube voltage, scanner and load, drawn by a seed."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ _KILOVOLTS = (70, 80, 90, 100, 110, 120)
 
 @dataclass(frozen=True)
 class Draw:
-    """What was drawn for a case; lengths in mm, angles in degrees.
+    """Parameters drawn for a case; lengths in mm, angles in degrees.
 
     Attributes:
-        seed: Of the draw.
-        material, screw_material: Of plate and screws.
-        num_holes, pitch, width, thickness: Of the plate.
-        hole_offset: 0 for round holes, else half the distance of the two circles of a combination hole.
-        flare: Width of the plate's upper end over that of its shaft.
-        bow_deg, twist_deg: Between the ends of the undeformed plate.
-        holes_used: Which holes have screws.
-        loose: Index among them of a screw that does not hold in its bone; None if all do.
-        tilt_deg: Largest tilt of a screw against its hole.
-        heads: Screws have heads that stand proud, of which no list of screws knows.
+        seed: Seed of the draw.
+        material, screw_material: Materials of plate and screws.
+        num_holes, pitch, width, thickness: Size of the plate; `pitch` is the distance between holes.
+        hole_offset: 0 for round holes, else half the distance between the two circles of a combination hole.
+        flare: Width of the plate's upper end divided by the width of its shaft.
+        bow_deg, twist_deg: Contouring of the undeformed plate: bending and torsion angle between its ends.
+        holes_used: Indices of the holes with screws.
+        loose: Index, within `holes_used`, of a screw that is loose in its bone; None if all hold.
+        tilt_deg: Largest angle between a screw and its hole's axis.
+        heads: True if the screws have heads above the plate, which are imaged but not in the list of screws.
         bend_deg, s_bend_deg, torsion_deg, lateral_deg: Load: angles between the innermost screws that hold.
         turn_deg, shift: Misalignment of the whole plate: rotation and translation vector.
         scanner: "extremity" or "c-arm".
         azimuth_deg: Gantry angle of the first of three neighbouring views; the plate is seen face on at 90.
         kvp: Tube voltage.
-        water_radius: Of the limb about the bone's axis; 0: a bare bone.
-        bone_radius, cortex, marrow: Outer radius and wall of the hollow bone; whether spongy bone fills it.
-        detector: The detector.
+        water_radius: Radius of the water cylinder (the limb) around the bone's axis; 0: a bare bone.
+        bone_radius, cortex: Outer radius and wall thickness of the hollow bone.
+        marrow: True if cancellous bone fills the hollow bone.
+        detector: Detector model.
     """
 
     seed: int
@@ -71,7 +72,7 @@ class Draw:
 
     @property
     def length(self) -> float:
-        """Of the plate, mm."""
+        """Length of the plate, mm."""
         return self.num_holes * self.pitch + 8.0
 
     @property
@@ -81,7 +82,7 @@ class Draw:
 
 
 def draw_case(seed: int) -> Draw:
-    """What a seed stands for: every choice independent, in ranges that plates, limbs and scanners have.
+    """Draw the parameters of a case. All choices are independent, in realistic ranges of plates, limbs and scanners.
 
     >>> draw_case(3) == draw_case(3), draw_case(3) == draw_case(4)
     (True, False)
@@ -97,7 +98,7 @@ def draw_case(seed: int) -> Draw:
         sides.append([holes[0], *rest])
     used = tuple(sorted(int(h) for side in sides for h in side))
     material = "steel" if rng.random() < 0.5 else "titanium"
-    other = {"steel": "titanium", "titanium": "steel"}[material]
+    other_material = {"steel": "titanium", "titanium": "steel"}[material]
     combination = rng.random() < 0.5
     pre_bent = rng.random() < 0.5
     kind = rng.choice(["plain", "s", "loose"], p=[0.5, 0.3, 0.2])
@@ -106,11 +107,11 @@ def draw_case(seed: int) -> Draw:
     bare = rng.random() < 0.2
     sides_of_scatter = rng.random() < 0.5
     scatter = float(rng.uniform(0.1, 0.5))
-    held = [index for index, hole in enumerate(used) if hole in (sides[0][0], sides[1][0])]
+    innermost = [index for index, hole in enumerate(used) if hole in (sides[0][0], sides[1][0])]
     return Draw(
         seed=seed,
         material=material,
-        screw_material=material if rng.random() < 0.65 else other,
+        screw_material=material if rng.random() < 0.65 else other_material,
         num_holes=num_holes,
         pitch=float(rng.uniform(14.5, 18.5)),
         width=float(rng.uniform(11.0, 14.0)),
@@ -120,7 +121,7 @@ def draw_case(seed: int) -> Draw:
         bow_deg=float(rng.uniform(-8.0, 8.0)) if pre_bent else 0.0,
         twist_deg=float(rng.uniform(-8.0, 8.0)) if pre_bent else 0.0,
         holes_used=used,
-        loose=int(rng.choice(held)) if kind == "loose" and min(len(s) for s in sides) > 1 else None,
+        loose=int(rng.choice(innermost)) if kind == "loose" and min(len(s) for s in sides) > 1 else None,
         tilt_deg=float(rng.uniform(3.0, 8.0)) if rng.random() < 0.5 else 0.0,
         heads=bool(rng.random() < 0.3),
         bend_deg=float(rng.uniform(-2.4, 2.4)) * (0.3 if kind == "s" else 1.0),

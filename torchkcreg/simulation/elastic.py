@@ -1,4 +1,4 @@
-"""A plate as an elastic body on the screws of two rigid fragments: how it moves, and the load that it carries."""
+"""Elastic plate on the screws of two rigid bone fragments: its motion and the load it carries."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from torchkcreg.physics import elastic_constants
 from .loads import RodMotion
 
 _PITCH_MM = 0.3
-_SCREW_SHEAR = 2e3  # N/mm, of a screw in its bone, by which its hold yields
-_SCREW_TURN = 1e5  # N mm/rad
-_SHARES = (0.2, 0.8)  # of the yield stress, that the plate's highest stresses have
-_HIGHEST = 0.98  # quantile that they are
+_SCREW_SHEAR = 2e3  # N/mm, median translational stiffness of a screw in its bone
+_SCREW_TURN = 1e5  # N mm/rad, median rotational stiffness
+_SHARES = (0.2, 0.8)  # range of the plate's highest stress, as a share of the yield stress
+_HIGHEST = 0.98  # quantile taken as the highest stress
 
 
 class ElasticMotion:
-    """Motion of any point of a straight plate's frame, float64 inside.
+    """Motion of points from the straight plate's frame to the loaded plate, computed in float64.
 
     Args:
-        rest: From the straight plate to the undeformed one.
-        deformation: Of the undeformed plate.
-        pose: Rigid motion (4, 4) of it afterwards.
+        rest: Motion from the straight plate to the undeformed (contoured) one.
+        deformation: Deformation of the undeformed plate.
+        pose: Rigid motion (4, 4) applied after the deformation.
     """
 
     def __init__(self, rest: RodMotion, deformation: FiniteElementDeformation, pose: Tensor) -> None:
@@ -40,13 +40,13 @@ class ElasticMotion:
 
     @torch.no_grad()
     def __call__(self, points: Tensor) -> Tensor:
-        """Moved points, of the shape and dtype of the points (..., 3) in mm."""
+        """Moved points in mm, with the shape and dtype of `points` (..., 3)."""
         rested = self.rest(points.double())
         moved = rested + self.deformation.displacement(rested)
         return transform_points(self.pose, moved.reshape(-1, 3)).reshape(points.shape).to(points)
 
     def frames(self, z: Tensor) -> Tensor:
-        """Frames (n, 4, 4) of the plate about heights z (n,): where (x, y, 0) of the section there goes."""
+        """Frames (n, 4, 4) fitted to the plate's motion near heights z (n,): each maps (x, y, 0) of a section."""
         around = torch.cartesian_prod(*(torch.linspace(-x, x, n).double() for x, n in zip((4.0, 1.2, 3.0), (5, 3, 5))))
         lifted = around + z.double()[:, None, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         return torch.stack([fit_rigid(around, moved) for moved in self(lifted)])
@@ -54,12 +54,12 @@ class ElasticMotion:
 
 @dataclass(frozen=True)
 class Fragments:
-    """Two pieces of bone, each rigid, and the screws that hold a plate on them.
+    """Two rigid bone fragments and the screws that hold a plate on them.
 
     Attributes:
-        heights: Of the screws that hold, on the straight plate, mm; those below 0 are in one fragment.
-        turn_deg: Rotation vector of the upper fragment against the lower one, about the origin.
-        shift: Translation of it after that, mm.
+        heights: Heights of the holding screws on the straight plate, mm. Screws below 0 are in the lower fragment.
+        turn_deg: Rotation vector of the upper fragment relative to the lower one, about the origin.
+        shift: Translation of the upper fragment after the rotation, mm.
     """
 
     heights: Sequence[float]
@@ -70,18 +70,18 @@ class Fragments:
 def elastic_motion(
     rest: RodMotion, plate: trimesh.Trimesh, material: str, fragments: Fragments, pose: Tensor, rng: np.random.Generator
 ) -> tuple[ElasticMotion, CarriedLoad]:
-    """How a plate moves on its screws, and what it carries.
+    """Motion of a plate on its screws, and the load it carries.
 
-    Screws yield in their bone by springs of random stiffness. The load is scaled so that the plate's highest stresses
-    are a random share of the yield stress.
+    Screws are held in the bone by springs of random stiffness. The load is scaled so that the plate's highest stress is
+    a random share of the yield stress.
 
     Args:
-        rest: From the straight plate to the undeformed one.
-        plate: The undeformed one.
-        material: Of it.
-        fragments: What bends it.
-        pose: Rigid motion (4, 4) of the plate as a whole, besides.
-        rng: Where the random numbers come from.
+        rest: Motion from the straight plate to the undeformed (contoured) one.
+        plate: Mesh of the undeformed plate.
+        material: Name of the plate's material.
+        fragments: Motion of the bone fragments, which bends the plate.
+        pose: Additional rigid motion (4, 4) of the whole plate.
+        rng: Random number generator.
     """
     cloud = ImplantPointCloud.from_mesh(plate, _PITCH_MM)
     holds = holds_of(cloud, find_holes(plate))
@@ -99,14 +99,14 @@ def elastic_motion(
 
 
 def _amounts(fragments: Fragments, rest: RodMotion, element: Superelement, rng: np.random.Generator) -> Tensor:
-    """Amounts (A,) for which used holds move as fragments and springs have it, and the others carry nothing."""
+    """Amounts (A,) for which used holds follow their fragments by springs, and the other holds carry no load."""
     centers = torch.tensor([hold.center for hold in element.holds], dtype=torch.float64)
     middles = rest(torch.tensor([[0.0, 0.0, z] for z in fragments.heights], dtype=torch.float64))
     used = torch.cdist(middles, centers).argmin(1).tolist()
     above = torch.tensor([z > 0 for z in fragments.heights], dtype=torch.float64)
     turn = torch.deg2rad(torch.tensor(fragments.turn_deg, dtype=torch.float64)).expand(len(used), 3)
     shift = torch.tensor(fragments.shift, dtype=torch.float64)
-    wanted = torch.cat([torch.linalg.cross(turn, centers[used]) + shift, turn], dim=1) * above[:, None]
+    prescribed = torch.cat([torch.linalg.cross(turn, centers[used]) + shift, turn], dim=1) * above[:, None]
     springs = rng.lognormal(0.0, 0.5, size=(len(used), 1)) * np.array([_SCREW_SHEAR] * 3 + [_SCREW_TURN] * 3)
     moved = hold_motions(element, used)  # (A, U, 6)
     loads = element.loads
@@ -116,27 +116,27 @@ def _amounts(fragments: Fragments, rest: RodMotion, element: Superelement, rng: 
     yielding = moved + loads[:, used] / torch.from_numpy(springs)
     rows = [
         torch.cat([yielding.flatten(1).T, rigid.flatten(0, 1)], dim=1),
-        torch.cat([loads[:, free].flatten(1).T, loads.new_zeros(6 * len(free), 6)], dim=1) * 1e-4,  # none there
+        torch.cat([loads[:, free].flatten(1).T, loads.new_zeros(6 * len(free), 6)], dim=1) * 1e-4,  # no load there
     ]
-    right = torch.cat([wanted.flatten(), loads.new_zeros(6 * len(free))])
-    return torch.linalg.lstsq(torch.cat(rows), right[:, None], driver="gelsd").solution[:number, 0]
+    right_hand_side = torch.cat([prescribed.flatten(), loads.new_zeros(6 * len(free))])
+    return torch.linalg.lstsq(torch.cat(rows), right_hand_side[:, None], driver="gelsd").solution[:number, 0]
 
 
 def hold_motions(element: Superelement, holds: list[int]) -> Tensor:
-    """Shift and small turn (A, U, 6) of holds at an amount of one."""
+    """Translation and small rotation (A, U, 6) of holds for a unit amount."""
     positions = transform_points(element.hexahedra.frame, element.hexahedra.positions)
-    found = []
+    motions = []
     for hold in holds:
         near = element.holds[hold].nodes(positions)
         arms = positions[near] - positions.new_tensor(element.holds[hold].center)
         fields = rigid_fields(arms)
         solution = torch.linalg.lstsq(fields.flatten(1).T, element.nodal[:, near].flatten(1).T.to(fields)).solution
-        found.append(solution.T)
-    return torch.stack(found, dim=1)
+        motions.append(solution.T)
+    return torch.stack(motions, dim=1)
 
 
 def rigid_at(center: Tensor) -> Tensor:
-    """Shift and turn (6, 6) at a place of the six rigid motions about the origin."""
-    same = torch.eye(3, dtype=center.dtype)
-    turning = torch.linalg.cross(same, center.expand(3, 3)).T
-    return torch.cat([torch.cat([same, turning], dim=1), torch.cat([torch.zeros_like(same), same], dim=1)])
+    """Translation and rotation (6, 6) at a point, for each of the six rigid motions about the origin."""
+    identity = torch.eye(3, dtype=center.dtype)
+    turning = torch.linalg.cross(identity, center.expand(3, 3)).T
+    return torch.cat([torch.cat([identity, turning], dim=1), torch.cat([torch.zeros_like(identity), identity], dim=1)])

@@ -1,4 +1,4 @@
-"""Implants as meshes: locking plates, flared curved plates, screws, a hollow bone with a gap, beads."""
+"""Hardware: meshes of straight and flared locking plates, their holes and screws, and the mapping of meshes."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def locking_plate(
 ) -> trimesh.Trimesh:
     """Watertight mesh of a straight plate with through holes in one row and rounded ends, centred on the origin.
 
-    Long axis z, width x, thickness y; the bone is on the side of negative y. The surface is a grid
-    of lines `max_edge` apart, so that the mesh bends smoothly.
+    Long axis z, width x, thickness y; the bone is at negative y. Grid lines `max_edge` apart make the mesh bend
+    smoothly.
 
     Args:
         length: Length along z, mm.
         width: Width along x, mm.
         thickness: Thickness along y, mm.
-        num_holes: Holes, evenly spaced; see `hole_positions`.
+        num_holes: Number of evenly spaced holes; see `hole_positions`.
         hole_radius: Radius of a hole, mm.
         end_margin: Length of each rounded end, mm; the rest is divided evenly among the holes.
         max_edge: Spacing of the surface's grid lines, mm; triangles' long sides are up to 1.6 times as long.
@@ -85,14 +85,14 @@ def locking_screws(
 
 
 def flared(plate: trimesh.Trimesh, length: float, flare: float) -> trimesh.Trimesh:
-    """A straight plate, itself, whose upper end is so many times as wide as its shaft."""
+    """Widen the upper end of a straight plate in place, to `flare` times its shaft's width, and return it."""
     share = ((plate.vertices[:, 2] / length - 0.05) / 0.35).clip(0, 1)
     plate.vertices[:, 0] *= 1 + (flare - 1) * share**2 * (3 - 2 * share)
     return plate
 
 
 def mapped(mesh: trimesh.Trimesh, mapping: Callable[[Tensor], Tensor]) -> trimesh.Trimesh:
-    """The mesh with every vertex moved, in float64."""
+    """Copy of the mesh with all vertices mapped in float64."""
     vertices = mapping(torch.tensor(np.asarray(mesh.vertices), dtype=torch.float64, device="cpu"))
     return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)
 

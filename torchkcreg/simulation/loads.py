@@ -1,4 +1,4 @@
-"""Loads on a plate: bending, S-bending, torsion and misalignment as the motion of a rod with rigid cross sections."""
+"""Loads on a plate (bending, S-bending, torsion, misalignment) as motion of a rod with rigid cross sections."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ STEP_MM = 0.5
 
 @dataclass(frozen=True)
 class Load:
-    """How much a plate along z is bent and displaced. All angles in degrees, all zero by default.
+    """Bending, torsion and displacement of a plate along z. All angles are in degrees and zero by default.
 
-    The curvature of bending and torsion is one smooth hump between the inner screws, as when the bone carries the load
-    everywhere else; the S-bend's is one hump up and one down, which leaves the ends parallel but offset. What of this
-    is a rigid motion of the whole plate is taken out: on average the plate moves by the misalignment alone.
+    The curvature of bending and torsion is one smooth hump between the inner screws, since the bone carries the load
+    everywhere else. The S-bend's curvature is one hump up and one down, which leaves the ends parallel but offset. The
+    rigid part of the bending motion is removed: on average the plate moves by the misalignment alone.
 
     Attributes:
         bend_deg: Angle between the two ends about x: the plate bends in the direction of its thickness y.
@@ -54,7 +54,7 @@ class Load:
             raise ValueError(f"zone_mm must lie between 0 and half of {self.length_mm} mm, got {self.zone_mm}")
 
     def motion(self) -> RodMotion:
-        """The motion of any point of the undeformed frame under this load."""
+        """Motion of points of the undeformed frame under this load."""
 
         def curvature(z: Tensor) -> Tensor:
             relative = (z / self.zone_mm).clamp(-1, 1)
@@ -75,7 +75,7 @@ class Load:
         return RodMotion(curvature, stretch, misalignment @ torch.linalg.inv(common))
 
     def _half_size(self) -> tuple[float, float, float]:
-        """Half the plate's size in mm; width and thickness only tell a torsion from none."""
+        """Half the plate's size in mm. Width and thickness matter little: they only make torsion visible to the fit."""
         return 7.0, 2.0, self.length_mm / 2
 
 
@@ -84,13 +84,13 @@ class RodMotion:
 
     The axis keeps its length; the frame `(R, c)` of the cross section at z solves `dR/dz = R [k(z)]x`, `dc/dz = R e_z`,
     with `R = I, c = 0` at z = 0, and a point goes from (x, y, z) to `R(z) (x, y, 0) + c(z)`, then through a rigid
-    motion of the whole. Within steps of 0.5 mm the curvature is constant and the solution exact. Beyond the bent
-    stretch the motion goes on rigidly. Being a callable, it maps points of any shape (..., 3), float64 inside.
+    motion of the whole. The curvature is constant within steps of 0.5 mm, for which the solution is exact. Outside
+    the bent stretch the motion continues rigidly. Calling it maps points of any shape (..., 3), in float64.
 
     Args:
-        curvature: Rotation per mm of the cross section about its own x, y, z: function of z `(n,)` to `(n, 3)`, 1/mm.
-        stretch: From where to where along z, in mm, the rod is bent; contains z = 0.
-        afterwards: Rigid motion (4, 4) of the whole; none by default.
+        curvature: Rotation of the cross section about its x, y, z axes per mm: function of z `(n,)` to `(n, 3)`, 1/mm.
+        stretch: Range (low, high) of z in mm in which the rod is bent; contains z = 0.
+        afterwards: Rigid motion (4, 4) applied after the bending; none by default.
 
     Raises:
         ValueError: If the stretch does not contain zero.
@@ -121,14 +121,14 @@ class RodMotion:
         if afterwards is not None:
             chain = afterwards.double() @ chain
         straight = rates.new_zeros(1, 3)
-        # the first and the last stretch are straight, without end
+        # the rod continues straight beyond both ends
         self._knots = knots
         self._frames = torch.cat([chain[:1], chain])
         self._rates = torch.cat([straight, rates, straight])
         self._starts = torch.cat([knots[:1], knots])
 
     def __call__(self, points: Tensor | Sequence[Sequence[float]]) -> Tensor:
-        """Moved points, of the shape and dtype of the points `(..., 3)` in mm."""
+        """Moved points in mm, with the shape and dtype of `points` `(..., 3)`."""
         given = torch.as_tensor(points)
         points = given.double()
         frames = self.frames(points[..., 2])
@@ -137,9 +137,10 @@ class RodMotion:
         return moved.to(given.dtype) if given.dtype.is_floating_point else moved
 
     def straightened(self, points: Tensor, *, iterations: int = 20) -> Tensor:
-        """Where points (..., 3) in mm were before the motion, float64: its inverse, near the rod.
+        """Inverse of the motion, near the rod: positions (..., 3) in mm, float64, before the motion.
 
-        A point lies in the cross section whose plane it is in, `(p - c(z)) . R(z) e_z = 0`; z is found by iteration.
+        The cross section of a point p is the one whose plane contains it, `(p - c(z)) . R(z) e_z = 0`; z is found by
+        iteration.
         """
         points = points.double()
         z = points[..., 2]
@@ -151,14 +152,14 @@ class RodMotion:
         return torch.cat([section[..., :2], z[..., None]], dim=-1)
 
     def frames(self, z: Tensor) -> Tensor:
-        """Frames (..., 4, 4) of the cross sections at z: in its own coordinates a section is at z = 0."""
+        """Frames (..., 4, 4) of the cross sections at z. In the frame's coordinates the section lies at z = 0."""
         interval = torch.searchsorted(self._knots, z.contiguous(), right=True)
         rest = z - self._starts[interval]
         return self._frames[interval] @ _rod_steps(self._rates[interval], rest)
 
 
 def _rod_steps(rates: Tensor, lengths: Tensor) -> Tensor:
-    """Frames (..., 4, 4) at the end of stretches of constant curvature (..., 3) and some lengths (...)."""
+    """Frames (..., 4, 4) at the end of rod segments with constant curvature (..., 3) and lengths (...)."""
     twist = rates.new_zeros(*rates.shape[:-1], 4, 4)
     x, y, z = (rates * lengths[..., None]).unbind(-1)
     twist[..., 0, 1], twist[..., 0, 2], twist[..., 1, 2] = -z, y, -x

@@ -1,4 +1,4 @@
-"""The flat outline of a plate with holes, triangulated in regular patches: one around each hole, one at each end."""
+"""Flat outline of a plate with holes, triangulated in regular patches: one around each hole, one at each end."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-DECIMALS = 6  # points nearer than a nanometre are one
+DECIMALS = 6  # of points in mm: points closer than a nanometre are merged
 CORNER_SHARE = 0.25  # length of a rounded end at the plate's edges, relative to its middle
 
 
@@ -21,7 +21,7 @@ def plate_outline(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 2) in (x, z) and triangles (m, 3) of a plate along z with a row of holes and rounded ends.
 
-    All triangles turn the same way. Sizes in mm, as `locking_plate` takes them. A hole is the union of two circles
+    All triangles have the same orientation. Sizes are in mm, as in `locking_plate`. A hole is the union of two circles
     whose centres lie `hole_offset` before and behind its middle.
 
     Raises:
@@ -84,7 +84,7 @@ def _end_patch(side: int, start: float, width: float, margin: float, across: int
 
 
 def _merged(patches: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """One triangulation of grids of points that share their borders, all triangles turning the same way."""
+    """Merge grids of points with common borders into one triangulation of uniformly oriented triangles."""
     points, triangles, first = [], [], 0
     for patch in patches:
         rows, cols = patch.shape[:2]
@@ -93,8 +93,10 @@ def _merged(patches: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         points.append(patch.reshape(-1, 2))
         triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
         first += rows * cols
-    _, kept, names = np.unique(np.concatenate(points).round(DECIMALS), axis=0, return_index=True, return_inverse=True)
-    flat, joined = np.concatenate(points)[kept], names.ravel()[np.concatenate(triangles)]
+    _, first_index, merged_index = np.unique(
+        np.concatenate(points).round(DECIMALS), axis=0, return_index=True, return_inverse=True
+    )
+    flat, joined = np.concatenate(points)[first_index], merged_index.ravel()[np.concatenate(triangles)]
     edges = flat[joined[:, 1:]] - flat[joined[:, :1]]
     clockwise = edges[:, 0, 0] * edges[:, 1, 1] < edges[:, 0, 1] * edges[:, 1, 0]
     joined[clockwise] = joined[clockwise, ::-1]

@@ -1,4 +1,4 @@
-"""What stands in a simulated beam, and its path lengths by material."""
+"""Bodies in a simulated beam, and their path lengths by material."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .solids import Solid, chord_image
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One body of one material.
+    """A body of one material.
 
     Attributes:
         name: Unique among the parts.
         shape: A closed mesh, or a solid with closed-form chords, in the world's frame.
         material: Name of a packaged material.
-        displaces: Names of solids that this part, a solid without a cavity, pushes aside where they overlap: a screw in
-            a bone. Parts that displace the same one must not overlap each other.
-        inside: Name of a part that wholly contains this one, which is missing there: a limb's soft tissue, a bath.
+        displaces: Names of the solids that this part displaces where they overlap, as a screw does in a bone. This part
+            must be a solid without a cavity. Parts that displace the same solid must not overlap each other.
+        inside: Name of a part that contains this one completely and is displaced by it: soft tissue, a water bath.
     """
 
     name: str
@@ -35,16 +35,16 @@ class Part:
 
 
 def material_paths(parts: Sequence[Part], matrix: Tensor, det_shape: tuple[int, int]) -> dict[str, Tensor]:
-    """Path lengths in mm (rows, cols), float64, of one view, by material, displaced parts taken out.
+    """Path lengths of one view by material (rows, cols), mm, float64, without the displaced volumes.
 
     Args:
-        parts: What stands in the beam.
+        parts: Bodies in the beam.
         matrix: Projection matrix (3, 4).
         det_shape: Rows and columns.
 
     Raises:
-        ValueError: If two parts share a name, a part refers to one that is not there, a mesh is not closed, or a mesh
-            is to displace or to be displaced.
+        ValueError: If two parts share a name, a part refers to an unknown one, a mesh is not closed, or a mesh
+            displaces a part or is displaced.
     """
     by_name = {part.name: part for part in parts}
     if len(by_name) != len(parts):
@@ -69,7 +69,7 @@ def material_paths(parts: Sequence[Part], matrix: Tensor, det_shape: tuple[int, 
 
 
 def _path(part: Part, matrix: Tensor, det_shape: tuple[int, int]) -> Tensor:
-    """Path lengths (rows, cols) of one part by itself."""
+    """Path lengths (rows, cols) of one part, ignoring all others."""
     if not isinstance(part.shape, trimesh.Trimesh):
         return chord_image(part.shape, matrix, det_shape)
     if not part.shape.is_watertight:
@@ -79,7 +79,7 @@ def _path(part: Part, matrix: Tensor, det_shape: tuple[int, int]) -> Tensor:
 
 
 def _named(parts: dict[str, Part], name: str, by: Part) -> Part:
-    """The part of this name."""
+    """Part with the given name, to which part `by` refers."""
     if name not in parts:
         raise ValueError(f"part {by.name} must refer to one of {', '.join(parts)}, got {name!r}")
     return parts[name]

@@ -1,4 +1,4 @@
-"""Random weight-bearing cases: plates, screws, limbs, spectra, scanners and loads as various as those of a clinic."""
+"""Random weight-bearing cases with clinically varied plates, screws, limbs, spectra, scanners and loads."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from .solids import Cylinder, Sphere, Tube
 
 PlateMotion = RodMotion | ElasticMotion
 ViewSet = Literal["neighbours", "around", "both", "spread", "many"]
-_SOFTENING_MM = 4.0  # over which a plate's curvature sets in beside a screw that holds it
+_SOFTENING_MM = 4.0  # length over which the plate's curvature rises from zero next to a holding screw
 
 
 def random_case(
     seed: int | Draw, *, views: ViewSet = "neighbours", elastic: bool = False, counts: Tensor | None = None
 ) -> SimulatedCase:
-    """A case of the population: its images and the truth about it.
+    """A case of the population: images and ground truth.
 
     Args:
-        seed: Names the case; or what was drawn, changed as you like.
-        views: Three neighbouring views, a focal spot each; six around the limb; or both, in this order. "spread": three
-            around the limb; "many": 24 around it.
-        elastic: The plate bends as its finite elements do under loads at its screws, which are known then; else as a
-            rod with a drawn curvature.
-        counts: The images, where they have been kept: making them takes seconds.
+        seed: Seed of the case, or its drawn parameters, which may have been changed.
+        views: "neighbours": three neighbouring views, one for each focal spot; "around": six around the limb; "both":
+            these nine, in this order; "spread": three around the limb; "many": 24 around the limb.
+        elastic: The plate bends by finite elements under loads at its screws, which are then known. Otherwise it bends
+            as a rod with a drawn curvature.
+        counts: Cached images of the case: simulating them takes seconds.
     """
     draw = seed if isinstance(seed, Draw) else draw_case(seed)
     rest, loaded = motions(draw)
@@ -84,25 +84,25 @@ def random_case(
 
 
 def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
-    """The views of a case, on the part of the panel behind the limb."""
+    """Geometry of a case's views, cropped to the part of the panel behind the limb."""
     spots = {"T1": 120.0, "T2": 0.0, "T3": -120.0}
     scanner = MultisourceScanner()
     if draw.scanner == "c-arm":
         spots = {"T1": 40.0, "T2": 0.0, "T3": -40.0}
         scanner = replace(scanner, sad=620.0, sdd=1050.0)
-    near = [draw.azimuth_deg + step for step in range(3)] if views in ("neighbours", "both") else []
+    neighbours = [draw.azimuth_deg + step for step in range(3)] if views in ("neighbours", "both") else []
     around = [draw.azimuth_deg + 30.0 * step + 10.0 for step in range(6)] if views in ("around", "both") else []
     around += [draw.azimuth_deg + 60.0 * step for step in range(3)] if views == "spread" else []
     around += [draw.azimuth_deg + 15.0 * step for step in range(24)] if views == "many" else []
-    angles = [*near, *around]
+    angles = [*neighbours, *around]
     names = [f"T{1 + index % 3}" for index in range(len(angles))]
-    whole = [
+    scanners = [
         replace(scanner, num_views=1, start_deg=angle, phase_deg=angle, firing_order=(name,), source_z_mm=spots)
         for angle, name in zip(angles, names, strict=True)
     ]
-    geometries = [one.geometry() for one in whole]
+    geometries = [single_view.geometry() for single_view in scanners]
     cols = 320 if draw.scanner == "c-arm" else 256
-    left = (scanner.det_shape[1] - cols) // 2
+    first_col = (scanner.det_shape[1] - cols) // 2
     joined = ConeBeamGeometry(
         torch.cat([g.projection_matrices for g in geometries]),
         scanner.det_shape,
@@ -110,11 +110,11 @@ def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
         sources=names,
         angles_deg=angles,
     )
-    return joined.crop(slice(32, scanner.det_shape[0] - 32), slice(left, left + cols))
+    return joined.crop(slice(32, scanner.det_shape[0] - 32), slice(first_col, first_col + cols))
 
 
 def motions(draw: Draw) -> tuple[RodMotion, PlateMotion]:
-    """From the straight plate to the undeformed one, and to the loaded one."""
+    """Motions from the straight plate to the undeformed (contoured) plate and to the loaded plate."""
     half = draw.length / 2
     bow = torch.deg2rad(torch.tensor([draw.bow_deg, 0.0, draw.twist_deg], dtype=torch.float64)) / draw.length
     held = [z for i, z in enumerate(draw.hole_heights[hole] for hole in draw.holes_used) if i != draw.loose]
@@ -142,7 +142,7 @@ def _misalignment(draw: Draw) -> Tensor:
 
 
 def _fragments(draw: Draw) -> Fragments:
-    """The bone's two halves, and the screws that hold; the S-bend is a shift of one against the other."""
+    """The two bone fragments and the holding screws. The S-bend is a relative shift of the fragments."""
     heights = [draw.hole_heights[hole] for index, hole in enumerate(draw.holes_used) if index != draw.loose]
     arm = min(z for z in heights if z > 0) - max(z for z in heights if z < 0)
     shift = (0.0, math.radians(draw.s_bend_deg) * arm / 4, 0.0)
@@ -163,7 +163,7 @@ def _straight_plate(draw: Draw) -> trimesh.Trimesh:
 
 
 def _screws(draw: Draw, rest: RodMotion, loaded: PlateMotion) -> tuple[list[Screw], list[Part]]:
-    """Screws as a list of them says, at rest, and as they stand in the beam, with heads that no list knows."""
+    """List of the screws without load, and their loaded parts in the beam, with heads that are not in the list."""
     rng = np.random.default_rng([draw.seed, 21])
     listed: list[Screw] = []
     parts = []
@@ -195,7 +195,7 @@ def _screws(draw: Draw, rest: RodMotion, loaded: PlateMotion) -> tuple[list[Scre
 
 
 def _limb(draw: Draw, loaded: PlateMotion) -> list[Part]:
-    """The bone's two fragments, each where its screws take it, and the water around them."""
+    """The two bone fragments, each moved with its screws, and the water around them."""
     depth = -(draw.thickness / 2 + 1.5 + draw.bone_radius)
     parts, tissue = [], _tissue(draw)
     for fragment, side in zip(FRAGMENTS, (-1.0, 1.0), strict=True):
@@ -221,7 +221,7 @@ def _tissue(draw: Draw) -> str | None:
 
 
 def _bead_positions(draw: Draw) -> Tensor:
-    """Centres (8, 3) of beads beside the straight plate, in sections that its outer screws hold."""
+    """Centres (8, 3) of beads beside the straight plate, near and beyond its outermost screws."""
     group = torch.tensor([[11.0, 2.0, 4.0], [-11.0, -2.0, 8.0], [10.0, -3.0, 14.0], [-10.0, 3.0, 19.0]]).double()
     low, high = (draw.hole_heights[hole] for hole in (draw.holes_used[0], draw.holes_used[-1]))
     below = group * torch.tensor([1.0, 1.0, -1.0]) + torch.tensor([0.0, 0.0, low + 4.0])

@@ -1,4 +1,4 @@
-"""A flat-panel scanner's images of meshes and solids: polyenergetic, scattered, blurred, noisy, quantised."""
+"""Images of meshes and solids from a flat-panel scanner: polyenergetic, with scatter, blur, noise, quantisation."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from torchkcreg.physics.blur import convolve, gaussian_kernel
 
 from .parts import Part, material_paths
 
-SCATTER_BLOCK = 8  # scatter is smooth: it is computed on blocks of this many pixels squared
+SCATTER_BLOCK = 8  # pixels along each side of the blocks on which scatter, which is smooth, is computed
 
 
 @dataclass(frozen=True)
 class DetectorModel:
-    """What happens between the transmitted beam and the numbers in the file.
+    """Detector model, from the transmitted beam to the counts in the file.
 
     Attributes:
         scatter_fraction: Scatter behind the object, as a share of the broadly blurred primary.
-        scatter_sigma_mm: How broadly, standard deviation on the detector, mm.
-        scatter_removed: Scatter from what the object removes (Ohnesorge et al. 1999): this times the broadly blurred
-            `p ln(1 / p)` of the primary p, with tails three times as wide for a quarter of it.
-        psf_sigma_mm: Blur of focal spot and scintillator on the detector, standard deviation, mm.
-        glare_share: Share of the signal that the scintillator spreads farther: the long tail of the blur.
-        glare_sigma_mm: How far, standard deviation, mm.
+        scatter_sigma_mm: Standard deviation of this blur on the detector, mm.
+        scatter_removed: Amplitude of the scatter from radiation removed by the object (Ohnesorge et al. 1999): it
+            multiplies the broadly blurred `p ln(1 / p)` of the primary p. A quarter of it has three times the width.
+        psf_sigma_mm: Standard deviation of the blur by focal spot and scintillator on the detector, mm.
+        glare_share: Share of the signal in the long tail of the scintillator's blur (glare).
+        glare_sigma_mm: Standard deviation of the glare, mm.
         open_beam: Counts of the unattenuated beam without scatter.
-        photons: Detected photons a pixel of the unattenuated beam; infinite: no quantum noise.
-        electronic_noise: Standard deviation, counts.
+        photons: Detected photons per pixel in the unattenuated beam; infinite: no quantum noise.
+        electronic_noise: Standard deviation of the electronic noise, counts.
         bits: The largest count is `2^bits - 1`.
         supersample: Sub-pixels along each side of a pixel whose transmission is averaged.
 
     Raises:
-        ValueError: If a value makes no sense.
+        ValueError: If a value is out of range.
     """
 
     scatter_fraction: float = 0.1
@@ -73,11 +73,11 @@ class DetectorModel:
 
     @property
     def saturation(self) -> int:
-        """The largest count, at which a pixel is full."""
+        """The largest count."""
         return 2**self.bits - 1
 
     def without_noise(self) -> DetectorModel:
-        """The same detector with neither quantum nor electronic noise (counts stay whole numbers)."""
+        """Copy of the detector without quantum and electronic noise. Counts are still rounded."""
         return replace(self, photons=float("inf"), electronic_noise=0.0)
 
 
@@ -89,22 +89,22 @@ def simulate_projections(
     detector: DetectorModel | None = None,
     seed: int = 0,
 ) -> Tensor:
-    """Counts `(V, rows, cols)`, uint16, of what stands in the beam.
+    """Simulated projections: counts `(V, rows, cols)`, uint16.
 
-    Each sub-pixel's transmission `sum_k w_k exp(-sum_m mu_mk L_m)` is averaged over the pixel, blurred by the point
-    spread, given its scatter, multiplied by the open beam, given Poisson noise of the number of photons and Gaussian
-    noise of the electronics, rounded, and cut off at the detector's range. Path lengths are exact averages over
-    sub-pixels for meshes and means of 2 x 2 rays for solids.
+    The transmission `sum_k w_k exp(-sum_m mu_mk L_m)` of the sub-pixels is averaged over each pixel and blurred by the
+    point spread function. Scatter and Poisson noise of the photons are added, and the signal is multiplied by the open
+    beam. Then Gaussian electronic noise is added, and the counts are rounded and clipped to the detector's range. Path
+    lengths are exact averages over sub-pixels for meshes and means of 2 x 2 rays for solids.
 
     Args:
         geometry: The views.
-        parts: What stands in the beam, in the world's frame.
-        spectrum: The detected spectrum, or one for each of the geometry's sources.
-        detector: The detector; the default one where None.
+        parts: Bodies in the beam, in the world's frame.
+        spectrum: The detected spectrum, or one for each source of the geometry, by name.
+        detector: Detector model; the default one if None.
         seed: Seed of the noise.
 
     Raises:
-        ValueError: As `material_paths` does, or where a view's source has no spectrum.
+        ValueError: If the parts are invalid (see `material_paths`), or the source of a view has no spectrum.
     """
     detector = detector or DetectorModel()
     if isinstance(spectrum, Spectrum):
@@ -115,8 +115,8 @@ def simulate_projections(
         spectra = [spectrum[source] for source in geometry.sources or ()]
     generator = torch.Generator().manual_seed(seed)
     images = []
-    for matrix, own in zip(geometry.projection_matrices, spectra, strict=True):
-        primary = _primary(matrix.cpu(), geometry.det_shape, parts, own, detector.supersample)
+    for matrix, view_spectrum in zip(geometry.projection_matrices, spectra, strict=True):
+        primary = _primary(matrix.cpu(), geometry.det_shape, parts, view_spectrum, detector.supersample)
         signal = _detected(primary, geometry.pixel_spacing, detector)
         images.append(_counts(signal, detector, generator))
     return torch.stack(images)
@@ -125,7 +125,7 @@ def simulate_projections(
 def _primary(
     matrix: Tensor, det_shape: tuple[int, int], parts: Sequence[Part], spectrum: Spectrum, factor: int
 ) -> Tensor:
-    """Transmitted share of the beam (rows, cols), averaged over each pixel's sub-pixels."""
+    """Transmitted share of the beam (rows, cols), averaged over the sub-pixels of each pixel."""
     fine = matrix.clone()
     # sub-pixel centres: u' = f u + (f - 1) / 2
     fine[:2] = factor * matrix[:2] + (factor - 1) / 2 * matrix[2]
@@ -162,7 +162,7 @@ def _spread_out(image: Tensor, pixel_spacing: tuple[float, float], sigma_mm: flo
 
 
 def _smooth(image: Tensor, pixel_spacing: tuple[float, float], sigma_mm: float) -> Tensor:
-    """An image (rows, cols) blurred broadly, on blocks of pixels."""
+    """Broad blur of an image (rows, cols), computed on blocks of pixels."""
     rows, cols = image.shape
     coarse_shape = (max(1, rows // SCATTER_BLOCK), max(1, cols // SCATTER_BLOCK))
     coarse = adaptive_avg_pool2d(image[None, None], coarse_shape)

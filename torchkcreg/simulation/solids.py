@@ -1,4 +1,4 @@
-"""Solids with closed-form chords: spheres, cylinders and tubes, for screws, bones, beads and water baths."""
+"""Solids with closed-form chord lengths: spheres, cylinders and tubes, for screws, bones, beads and water baths."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 
 from torchkcreg.geometry import transform_points
 
-PARALLEL = 1e-12  # a direction's component below this counts as none
+PARALLEL = 1e-12  # direction components below this count as zero
 BLOCK_ROWS = 64  # detector rows whose rays are traced together
 
 
 class Convex(Protocol):
-    """A convex solid: a ray is inside between two distances."""
+    """A convex solid: a ray is inside it between two distances."""
 
     def interval(self, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances where rays enter and leave, `(...)`, of unit directions `(..., 3)`; equal or reversed at a miss."""
+        """Entry and exit distances `(...)` of rays with unit directions `(..., 3)`; entry >= exit if a ray misses."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """A ball: a bead.
+    """A sphere, such as a bead.
 
     Attributes:
         center: Centre (3,), mm.
@@ -45,18 +45,18 @@ class Sphere:
 
     @property
     def cavity(self) -> Convex | None:
-        """What is missing from the hull: nothing."""
+        """The cavity in the hull: none."""
         return None
 
     def interval(self, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances where rays enter and leave."""
+        """Entry and exit distances of rays."""
         offset = self.center - origin
         nearest = directions @ offset
         half = (self.radius**2 - offset @ offset + nearest**2).clamp_min(0).sqrt()
         return nearest - half, nearest + half
 
     def corners(self) -> Tensor:
-        """Corners (8, 3) of a box around it."""
+        """Corners (8, 3) of a box around the sphere."""
         return self.center + self.radius * _cube_corners()
 
     def moved(self, transform: Tensor) -> Sphere:
@@ -66,11 +66,11 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Cylinder:
-    """A straight cylinder: a screw, a rod, a bath.
+    """A straight cylinder, such as a screw, a rod or a water bath.
 
     Attributes:
         start: Centre of one end (3,), mm.
-        end: Centre of the other, mm.
+        end: Centre of the other end (3,), mm.
         radius: Radius, mm.
     """
 
@@ -91,11 +91,11 @@ class Cylinder:
 
     @property
     def cavity(self) -> Convex | None:
-        """What is missing from the hull: nothing."""
+        """The cavity in the hull: none."""
         return None
 
     def interval(self, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances where rays enter and leave."""
+        """Entry and exit distances of rays."""
         length = (self.end - self.start).norm()
         axis = (self.end - self.start) / length
         offset = origin - self.start
@@ -105,9 +105,9 @@ class Cylinder:
         discriminant = half_linear**2 - across * (offset @ offset - height**2 - self.radius**2)
         reach = discriminant.clamp_min(0).sqrt()
         slope = torch.where(along.abs() < PARALLEL, torch.full_like(along, PARALLEL), along)
-        one, other = -height / slope, (length - height) / slope
-        enter = torch.maximum((-half_linear - reach) / across, torch.minimum(one, other))
-        leave = torch.minimum((-half_linear + reach) / across, torch.maximum(one, other))
+        bottom, top = -height / slope, (length - height) / slope
+        enter = torch.maximum((-half_linear - reach) / across, torch.minimum(bottom, top))
+        leave = torch.minimum((-half_linear + reach) / across, torch.maximum(bottom, top))
         return enter, torch.where(discriminant > 0, leave, enter)
 
     def corners(self) -> Tensor:
@@ -123,13 +123,13 @@ class Cylinder:
 
 @dataclass(frozen=True, eq=False)
 class Tube:
-    """A straight tube, open at both ends: the shaft of a long bone.
+    """A straight tube, open at both ends, such as the shaft of a long bone.
 
     Attributes:
         start: Centre of one end (3,), mm.
-        end: Centre of the other, mm.
+        end: Centre of the other end (3,), mm.
         outer_radius: Outer radius, mm.
-        inner_radius: Inner radius, mm, below the outer.
+        inner_radius: Inner radius, mm, smaller than the outer.
     """
 
     start: Tensor
@@ -187,13 +187,16 @@ Solid = Sphere | Cylinder | Tube
 
 
 def chord_lengths(solid: Solid, origin: Tensor, directions: Tensor, *, within: Solid | None = None) -> Tensor:
-    """Lengths in mm `(...)` of rays from `origin` (3,) along unit `directions` `(..., 3)` inside a solid.
+    """Chord lengths in mm `(...)` of rays from `origin` (3,) along unit `directions` `(..., 3)` through a solid.
 
     Args:
-        solid: What is crossed.
-        origin: The source.
+        solid: Solid that the rays cross.
+        origin: Position of the source.
         directions: Unit vectors.
-        within: If given, only what lies inside this solid too counts; it must have no cavity.
+        within: If given, only lengths that are also inside this solid count; it must have no cavity.
+
+    Raises:
+        ValueError: If `within` has a cavity.
 
     >>> from torchkcreg.simulation import Sphere
     >>> along_z = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -214,10 +217,10 @@ def chord_lengths(solid: Solid, origin: Tensor, directions: Tensor, *, within: S
 def chord_image(
     solid: Solid, matrix: Tensor, det_shape: tuple[int, int], *, rays: int = 2, within: Solid | None = None
 ) -> Tensor:
-    """Chord lengths in mm (rows, cols), float64, the mean of `rays` x `rays` rays a pixel.
+    """Chord lengths in mm (rows, cols), float64, averaged over `rays` x `rays` rays per pixel.
 
     Args:
-        solid: What is crossed, in the world's frame.
+        solid: Solid that the rays cross, in the world's frame.
         matrix: Projection matrix (3, 4).
         det_shape: Rows and columns.
         rays: Rays along each side of a pixel.
@@ -241,13 +244,13 @@ def chord_image(
 
 
 def _common_length(bodies: Sequence[Convex], origin: Tensor, directions: Tensor) -> Tensor:
-    """Length inside all of some convex bodies."""
+    """Length inside the intersection of convex bodies."""
     enters, leaves = zip(*(body.interval(origin, directions) for body in bodies))
     return (torch.stack(leaves).amin(0) - torch.stack(enters).amax(0)).clamp_min(0)
 
 
 def _shadow(corners: Tensor, matrix: Tensor, det_shape: tuple[int, int]) -> tuple[range, range]:
-    """Rows and columns that a solid between these corners can darken."""
+    """Rows and columns of the shadow of a solid within these corners."""
     homogeneous = corners @ matrix[:, :3].T + matrix[:, 3]
     if bool((homogeneous[:, 2] <= 0).any()):
         return range(det_shape[0]), range(det_shape[1])
@@ -258,6 +261,6 @@ def _shadow(corners: Tensor, matrix: Tensor, det_shape: tuple[int, int]) -> tupl
 
 
 def _ray_positions(pixels: range, rays: int) -> Tensor:
-    """Pixel coordinates of the rays of a run of pixels, centres at whole numbers."""
+    """Pixel coordinates of the rays for a range of pixels, with pixel centres at integers."""
     fine = torch.arange(pixels.start * rays, max(pixels.stop, pixels.start) * rays, dtype=torch.float64)
     return (fine + 0.5) / rays - 0.5

@@ -1,5 +1,6 @@
-"""Control points on a lattice around an implant, and the cubic B-spline field between them. Displacements of control
-points are in the grid's axes, points and fields in the implant's frame.
+"""Lattice of control points around an implant, and the cubic B-spline displacement field between them.
+
+Displacements of control points are in the grid's axes; points and fields are in the implant's frame.
 """
 
 from .basis import SplineBasis, cubic_bspline_derivatives, cubic_bspline_weights

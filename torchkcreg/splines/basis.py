@@ -1,9 +1,9 @@
-"""The cubic B-spline basis at many points, worked on one knot cell at a time.
+"""Cubic B-spline basis at many points, evaluated one knot cell at a time.
 
-All points of a knot cell (the box between eight neighbouring control points) share the same 64 control points. Sorted
-by cell, a spline is then a product of a (points, 64) matrix, built in cache and thrown away, with a (64, features)
-matrix: no gathering of 64 values a point, and nothing of size N x 64 in memory, in the backward pass neither. The
-kernel in ``csrc/cpu/splines.cpp`` takes the same points in the same order.
+All points of a knot cell (the box between eight neighbouring control points) share the same 64 control points. With
+points sorted by cell, a spline is the product of a (points, 64) matrix, built block by block in cache, with a
+(64, features) matrix. Nothing is gathered point by point, and no N x 64 array is stored, not even for the backward
+pass. The kernel in `csrc/cpu/splines.cpp` processes the points in the same order.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def cubic_bspline_weights(eta: Tensor) -> Tensor:
     B_0 = (1 - e)^3 / 6, B_1 = (3 e^3 - 6 e^2 + 4) / 6, B_2 = (-3 e^3 + 3 e^2 + 3 e + 1) / 6, B_3 = e^3 / 6.
 
     Args:
-        eta: position in the knot interval, 0 to 1, in units of the spacing; any shape.
+        eta: Position in the knot interval, 0 to 1, in units of the spacing; any shape.
 
     Returns:
-        Tensor of shape (..., 4); sums to 1.
+        Tensor of shape (..., 4); sums to 1 over the last axis.
 
     Example:
         >>> (6 * cubic_bspline_weights(torch.tensor(0.0))).round().tolist()
@@ -44,10 +44,10 @@ def cubic_bspline_weights(eta: Tensor) -> Tensor:
 
 
 def cubic_bspline_derivatives(eta: Tensor) -> Tensor:
-    """Derivatives of the four weights by eta, shape (..., 4); they sum to 0. Divide by the spacing for 1/mm.
+    """Derivatives of the four weights with respect to eta, shape (..., 4), sum 0. Divide by the spacing for 1/mm.
 
     Args:
-        eta: position in the knot interval, 0 to 1, in units of the spacing; any shape.
+        eta: Position in the knot interval, 0 to 1, in units of the spacing; any shape.
 
     Example:
         >>> cubic_bspline_derivatives(torch.tensor(0.0)).tolist()
@@ -57,11 +57,11 @@ def cubic_bspline_derivatives(eta: Tensor) -> Tensor:
 
 
 def bspline_pieces(eta: Tensor, order: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The four weights, or their derivatives of the given order, one tensor of the shape of `eta` each.
+    """Four weights, or their derivatives of the given order, each a tensor of the shape of `eta`.
 
     Args:
-        eta: position in the knot interval, any shape.
-        order: of the derivative, from 0 on; beyond 3 all are zero.
+        eta: Position in the knot interval, any shape.
+        order: Order of the derivative, 0 for the weights. Above 3 all are zero.
     """
     rest = 1 - eta
     if order == 0:
@@ -76,17 +76,17 @@ def bspline_pieces(eta: Tensor, order: int = 0) -> tuple[Tensor, Tensor, Tensor,
         return -rest * rest / 2, (1.5 * eta - 2) * eta, (2 - 1.5 * rest) * rest, eta * eta / 2
     if order == 2:
         return rest, 3 * eta - 2, 3 * rest - 2, eta
-    one = torch.ones_like(eta) if order == 3 else torch.zeros_like(eta)
-    return -one, 3 * one, -3 * one, one
+    constant = torch.ones_like(eta) if order == 3 else torch.zeros_like(eta)
+    return -constant, 3 * constant, -3 * constant, constant
 
 
 @dataclass(frozen=True, eq=False)
 class _Sorted:
-    """Points sorted by the knot cell that they lie in.
+    """Points sorted by their knot cell.
 
     Attributes:
-        order: Indices (N,) of the points, those of the first cell first.
-        ends: Where each cell's points end in them, (num_cells,).
+        order: Indices (N,) of the points, sorted by cell.
+        ends: End of each cell's points in `order`, (num_cells,).
     """
 
     order: Tensor
@@ -94,7 +94,7 @@ class _Sorted:
 
     @functools.cached_property
     def blocks(self) -> list[tuple[int, Tensor]]:
-        """The points in blocks of bounded size: the cell, the points' indices."""
+        """Blocks of at most `_POINTS_PER_BLOCK` points: number of the cell and indices of the points."""
         sizes = self.ends.diff(prepend=self.ends.new_zeros(1)).tolist()
         return [
             (cell, block)
@@ -105,19 +105,19 @@ class _Sorted:
 
 
 class SplineBasis:
-    """Where points lie among the knots of a grid: evaluates splines there, and its adjoint.
+    """Evaluates splines on a grid, and the adjoint, at fixed points.
 
     Args:
-        grid: control points.
-        points: in the implant's frame, mm, shape (N, 3).
-        dtype: of the weights; the points' own if not given.
+        grid: Control points.
+        points: Points in the implant's frame, mm, shape (N, 3).
+        dtype: Type of the weights. None: that of the points.
 
     Raises:
-        ValueError: if the points' shape is another, or one is not finite.
+        ValueError: If the points do not have shape (N, 3), or one is not finite.
 
     Attributes:
-        eta: (N, 3), position of each point in its knot cell, 0 to 1; differentiable in the points.
-        cells: (num_cells, 3) long, lowest CP index of the 64 of each occupied cell; beyond the grid it may be negative.
+        eta: Position of each point in its knot cell, 0 to 1, (N, 3); differentiable in the points.
+        cells: Lowest index of the 64 CPs of each occupied cell, (num_cells, 3) long. Negative outside the grid.
     """
 
     def __init__(self, grid: ControlPointGrid, points: Tensor, dtype: torch.dtype | None = None) -> None:
@@ -135,7 +135,7 @@ class SplineBasis:
     def control_points(self) -> tuple[Tensor, Tensor]:
         """Indices (num_cells, 64, 3) of the CPs of each cell, virtual ones included, and (num_cells, 64) of real CPs.
 
-        The latter are flat indices of the real CP nearest to each: itself, or the one on the border of the grid.
+        The second tensor holds flat indices of the nearest real CP: the CP itself, or one on the border of the grid.
         """
         steps = torch.arange(4, device=self.cells.device)
         offsets = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).reshape(64, 3)
@@ -145,32 +145,32 @@ class SplineBasis:
         return indices, (x.clamp(0, nx - 1) * ny + y.clamp(0, ny - 1)) * nz + z.clamp(0, nz - 1)
 
     def evaluate(self, features: Tensor, orders: _Orders = (0, 0, 0)) -> Tensor:
-        """Splines ``sum_c B_c(x) features_c`` at the points, shape (N, F), differentiable in points and features.
+        """Splines `sum_c B_c(x) features_c` at the points, shape (N, F), differentiable in points and features.
 
         Args:
-            features: of the CPs of each cell, shape (num_cells, 64, F), in the basis's dtype.
-            orders: of the derivative along each grid axis, in units of the spacing.
+            features: Values of the CPs of each cell, shape (num_cells, 64, F), in the basis's dtype.
+            orders: Order of the derivative along each grid axis; derivatives are in units of the spacing.
         """
         return _Evaluate.apply(self.eta, features, self._sorted, orders)
 
     def scatter(self, values: Tensor, orders: _Orders = (0, 0, 0)) -> Tensor:
-        """Adjoint of `evaluate`: ``sum_n B_c(x_n) values_n`` for the CPs of each cell, shape (num_cells, 64, F).
+        """Adjoint of `evaluate`: `sum_n B_c(x_n) values_n` for the CPs of each cell, shape (num_cells, 64, F).
 
         Args:
-            values: of the points, shape (N, F), in the basis's dtype.
-            orders: as in `evaluate`.
+            values: Values of the points, shape (N, F), in the basis's dtype.
+            orders: As in `evaluate`.
         """
         return _Scatter.apply(self.eta, values, self._sorted, orders, len(self.cells))
 
     def gradients(self) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Block by block of points in one cell: the cell, the points' indices (n,), and d B_c / d eta, (64, 3, n)."""
+        """Yield for each block of points in a cell: cell, indices of the points (n,), and d B_c / d eta (64, 3, n)."""
         along = [_Workspace(self.eta.detach(), orders) for orders in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
         for cell, rows in self._sorted.blocks:
             yield cell, rows, torch.stack([weights(rows) for weights in along], dim=1)
 
 
 class _Splines(torch.autograd.Function):
-    """Splines at points eta (N, 3), linear in the data of the CPs or of the points."""
+    """Splines at points eta (N, 3), linear in the values of the CPs or of the points."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
@@ -244,21 +244,21 @@ class _Scatter(_Splines):
 
 
 def _slope(eta: Tensor, features: Tensor, values: Tensor, ctx: Any) -> Tensor:
-    """Gradient (N, 3) by eta of ``sum_n values_n . spline(x_n)``: derivatives are splines again."""
+    """Gradient (N, 3) with respect to eta of `sum_n values_n . spline(x_n)`; derivatives are splines again."""
     slopes = (_Evaluate.apply(eta, features, ctx.points, o) for o in _steeper(ctx.orders))
     return torch.stack([(values * slope).sum(-1) for slope in slopes], dim=-1)
 
 
 def _steeper(orders: _Orders) -> list[_Orders]:
-    """Orders of the derivatives along each axis."""
+    """Orders of the next higher derivatives along each axis."""
     x, y, z = orders
     return [(x + 1, y, z), (x, y + 1, z), (x, y, z + 1)]
 
 
 class _Workspace:
-    """Weights of one block of points after the other, in memory that is asked for once.
+    """Weights of blocks of points, in memory that is allocated once and reused.
 
-    Freshly allocated megabytes cost more than the arithmetic done in them.
+    Allocating it anew for each block would take longer than the arithmetic.
     """
 
     def __init__(self, eta: Tensor, orders: _Orders) -> None:
@@ -266,9 +266,9 @@ class _Workspace:
         self.pairs, self.weights = eta.new_empty(16 * _POINTS_PER_BLOCK), eta.new_empty(64 * _POINTS_PER_BLOCK)
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Weights (64, n) of n points, x offset slowest, valid until the next call.
+        """Weights (64, n) of n points, with the x offset slowest, valid until the next call.
 
-        Points run last, so that the products vectorise over them.
+        Points are the last axis, so that the products vectorise over them.
         """
         eta, n = self.eta[rows].T.contiguous(), len(rows)
         x, y, z = (torch.stack(bspline_pieces(e, o)) for e, o in zip(eta, self.orders, strict=True))
@@ -277,7 +277,7 @@ class _Workspace:
 
 
 def _sort_by_cell(lowest: Tensor) -> tuple[Tensor, _Sorted]:
-    """Occupied cells (num_cells, 3), and the points sorted by cell."""
+    """Occupied cells (num_cells, 3) and the points sorted by cell."""
     if len(lowest) == 0:
         return lowest, _Sorted(lowest[:, 0], lowest[:, 0])
     start = lowest.amin(0)
@@ -290,7 +290,7 @@ def _sort_by_cell(lowest: Tensor) -> tuple[Tensor, _Sorted]:
 
 
 def _evaluated(eta: Tensor, features: Tensor, order: Tensor, ends: Tensor, x: int, y: int, z: int) -> Tensor:
-    """The definition, in plain torch."""
+    """Reference in plain torch."""
     weights, size = _Workspace(eta, (x, y, z)), features.shape[-1]
     out, block = features.new_empty(len(eta), size), features.new_empty(_POINTS_PER_BLOCK, size)
     for cell, rows in _Sorted(order, ends).blocks:

@@ -1,4 +1,4 @@
-"""The displacements that control points give to points: eq. 2 and 3 of Cao et al. 2020."""
+"""Displacements of points by a spline on control points (CPs): eq. 2 and 3 of Cao et al. 2020."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ def spline_displacement(
 ) -> Tensor:
     """Displacements of points by a cubic B-spline, in the implant's frame, mm (eq. 2 of Cao et al. 2020).
 
-    u(x) = sum_lmn B_l B_m B_n phi[c + (l, m, n)]. Where a CP would lie beyond the grid a virtual one stands in: it
-    belongs to the group of the nearest real CP and moves with that group's rigid motion, the least-squares fit of
-    c -> c + phi_c over the group's real CPs. Far from the grid the field thus is the nearest group's rigid motion.
+    u(x) = sum_lmn B_l B_m B_n phi[c + (l, m, n)]. CPs outside the grid are virtual: each belongs to the group of the
+    nearest real CP and moves with that group's rigid motion, the least-squares fit of c -> c + phi_c over the group's
+    real CPs. So far from the grid the field is the rigid motion of the nearest group.
 
     Args:
-        grid: control points.
-        control_points: displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
-        points: in the implant's frame, mm, shape (..., N, 3) or (3,).
-        labels: group of each CP, (nx, ny, nz) long; one group if not given.
+        grid: Control points.
+        control_points: Displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
+        points: Points in the implant's frame, mm, shape (..., N, 3) or (3,).
+        labels: Group of each CP, (nx, ny, nz) long. None: a single group.
 
     Returns:
         Tensor of shape (leading axes of `control_points`) + (shape of `points`), in the dtype of `points`.
 
     Raises:
-        ValueError: if shapes do not fit, or a point is not finite.
+        ValueError: If shapes do not match, or a point is not finite.
 
     Example:
         >>> grid = ControlPointGrid((4, 4, 4), (10.0, 10.0, 10.0), torch.eye(4))
@@ -51,12 +51,12 @@ def spline_displacement(
 
 
 def group_rigid_motions(grid: ControlPointGrid, control_points: Tensor, labels: Tensor) -> Tensor:
-    """Rigid motion (..., G, 4, 4) in the grid's frame that fits c -> c + phi_c best for each group's real CPs.
+    """Rigid motion (..., G, 4, 4) in the grid's frame that best fits c -> c + phi_c over each group's real CPs.
 
     Args:
-        grid: control points.
-        control_points: displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
-        labels: group of each CP, (nx, ny, nz) long, with every group from 0 to G - 1.
+        grid: Control points.
+        control_points: Displacements phi in the grid's axes, mm, shape (..., nx, ny, nz, 3).
+        labels: Group of each CP, (nx, ny, nz) long. Every group from 0 to G - 1 must occur.
     """
     positions = grid.positions().to(control_points).reshape(1, -1, 3)
     moved = positions + control_points.flatten(-4, -2).unsqueeze(-3)
@@ -74,7 +74,7 @@ def cell_features(grid: ControlPointGrid, basis: SplineBasis, control_points: Te
     virtual = (positions != real).any(-1).nonzero().squeeze(-1)
     if len(virtual):
         labels = torch.zeros(grid.shape, dtype=torch.long, device=phi.device) if labels is None else labels
-        # Labels in use, renumbered: a group without real CPs has no motion.
+        # Renumber the labels in use: a group without real CPs has no motion.
         groups = torch.unique(labels, return_inverse=True)[1]
         motions = group_rigid_motions(grid, phi.reshape(-1, *grid.shape, 3), groups)
         motions = motions[:, groups.flatten()[nearest.flatten()[virtual]]]

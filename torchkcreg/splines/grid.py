@@ -1,4 +1,4 @@
-"""The lattice of control points around an implant."""
+"""Lattice of control points around an implant."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from torchkcreg.geometry import invert_rigid, transform_points
 
 @dataclass(frozen=True, eq=False)
 class ControlPointGrid:
-    """Regular lattice of control points (CPs) in a frame of its own.
+    """Regular lattice of control points (CPs) in its own coordinate frame.
 
     CP (i, j, k) lies at (i sx, j sy, k sz) mm in the grid's frame. A cubic B-spline needs two CPs on each side of a
     point, so the valid domain spans CPs 1 to n - 2 along each axis.
 
     Attributes:
-        shape: numbers of CPs (nx, ny, nz), at least 4 each.
-        spacing: mm, (sx, sy, sz).
-        frame: rigid transform (4, 4), float64, from the grid's frame to the implant's.
+        shape: Numbers of CPs (nx, ny, nz), at least 4 each.
+        spacing: Spacing (sx, sy, sz), mm.
+        frame: Rigid transform (4, 4), float64, from the grid's frame to the implant's.
 
     Raises:
-        ValueError: if a count, a spacing or the frame is not one.
+        ValueError: If a count, a spacing or the frame is invalid.
 
     Example:
         >>> grid = ControlPointGrid((6, 6, 10), (8.75, 8.75, 25.0), torch.eye(4))
@@ -75,11 +75,11 @@ class ControlPointGrid:
         return {"shape": list(self.shape), "spacing_mm": list(self.spacing), "grid_to_implant": self.frame}
 
     def to_grid(self, points: Tensor) -> Tensor:
-        """Points (..., 3) of the implant's frame in the grid's frame, mm, in the points' dtype."""
+        """Transform points (..., 3), mm, from the implant's frame to the grid's frame; keeps their dtype."""
         return transform_points(invert_rigid(self.frame).to(points.device), points)
 
     def to_implant(self, vectors: Tensor) -> Tensor:
-        """Vectors (..., 3), such as displacements, turned from the grid's axes to the implant's."""
+        """Rotate vectors (..., 3), such as displacements, from the grid's axes to the implant's."""
         return vectors @ self.frame[:3, :3].T.to(vectors)
 
     def contains(self, points: Tensor) -> Tensor:
@@ -98,16 +98,16 @@ def default_grid(
 ) -> ControlPointGrid:
     """Grid centred on an implant, along its principal axes, the shortest first and the longest last.
 
-    It has as many CPs as hold the implant and one spacing of margin on each side inside the valid domain, and never
-    fewer than `shape`. The defaults are those of Cao et al. (2020).
+    It has enough CPs that the implant lies in the valid domain with a margin of one spacing on each side, and at least
+    `shape`. The defaults are those of Cao et al. (2020).
 
     Args:
-        points: nodes of the implant in its frame, mm, shape (N, 3).
-        shape: least number of CPs along each axis.
-        spacing: of the CPs, mm.
+        points: Nodes of the implant in its frame, mm, shape (N, 3).
+        shape: Smallest number of CPs along each axis.
+        spacing: Spacing of the CPs, mm.
 
     Raises:
-        ValueError: if there is no point, or one that is not finite.
+        ValueError: If there is no point, or one is not finite.
 
     Example:
         >>> grid = default_grid(torch.rand(1000, 3) * torch.tensor([160.0, 4.0, 12.0]))
@@ -121,7 +121,7 @@ def default_grid(
     along = points @ axes
     low, high = along.amin(0), along.amax(0)
     counts = [
-        # n CPs have n - 3 spacings of valid domain; they must hold the extent and a spacing on either side.
+        # n CPs have a valid domain of n - 3 spacings, which must cover the extent and a spacing on either side.
         max(int(least), math.ceil(extent / step - 1e-9) + 5)
         for least, extent, step in zip(shape, (high - low).tolist(), spacing, strict=True)
     ]
@@ -133,7 +133,7 @@ def default_grid(
 
 
 def _principal_axes(points: Tensor) -> Tensor:
-    """Principal axes as columns of a proper rotation, shortest first, each pointing to its largest component's plus."""
+    """Principal axes as columns of a proper rotation, shortest first; the largest component of each is positive."""
     centered = points - points.mean(0)
     axes = torch.linalg.eigh(centered.T @ centered).eigenvectors
     largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))

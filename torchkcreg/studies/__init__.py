@@ -1,4 +1,4 @@
-"""Studies of many registrations on simulated cases: one runner that keeps what is finished, tables and figures."""
+"""Studies of many registrations on simulated cases, run in parallel and resumable, with tables and figures."""
 
 from .capture import CaptureStudy, CaptureTrial, capture_study
 from .catalogue import STUDIES, Study, StudyOptions, run_study

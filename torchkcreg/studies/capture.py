@@ -1,4 +1,4 @@
-"""Capture range: from how far off the rigid stages of a registration still find an implant."""
+"""Capture range: the largest start error from which the rigid stages of a registration still find the implant."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from torchkcreg.physics import line_integrals_from_intensity
 from torchkcreg.registration import RegistrationConfig, RegistrationData, RegistrationResult, Stage, register
 from torchkcreg.simulation import Load, SimulatedCase, weight_bearing_case
 
-MISALIGNED = Load(rotation_deg=(0.4, -0.5, 0.6), translation_mm=(0.8, -0.7, 1.0))  # moved as a whole, not bent
+MISALIGNED = Load(rotation_deg=(0.4, -0.5, 0.6), translation_mm=(0.8, -0.7, 1.0))  # rigid motion, no bending
 DEFAULT_OFFSETS = (2.0, 5.0, 10.0, 15.0)
 CAPTURED_MM = 0.2
-_FEW_NODES = 8  # times coarser than the cloud: a rigid error needs no more
+_FEW_NODES = 8  # coarsening factor of the point cloud: a rigid error needs few nodes
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class CaptureTrial:
 
     Attributes:
         offset: Distance in mm and angle in degrees of the start pose from the truth.
-        start_mm: RMS distance of the implant's nodes from their true places at the start.
+        start_mm: RMS distance of the implant's nodes from their true positions at the start.
         error_mm: The same at the end.
-        basin_mm: RMS distance from where a start at the truth ends: above a few tenths, it is another minimum.
-        gc: Gradient correlation at the end, mean of the views.
-        seconds: Duration.
+        basin_mm: RMS distance from the result of a start at the truth. Above a few tenths it is another minimum.
+        gc: Gradient correlation at the end, mean over the views.
+        seconds: Duration of the registration.
     """
 
     offset: float
@@ -50,7 +50,7 @@ class CaptureStudy:
     """Registrations from random starts at several offsets.
 
     Attributes:
-        trials: All of them, offset after offset.
+        trials: All trials, ordered by offset.
         captured_mm: Rigid error (RMS over the implant's nodes) below which a start counts as captured.
     """
 
@@ -67,15 +67,15 @@ class CaptureStudy:
         return [trial for trial in self.trials if trial.offset == offset]
 
     def captured_share(self, offset: float) -> float:
-        """Share of the starts at an offset that end below ``captured_mm``."""
+        """Share of the starts at an offset whose final error is below `captured_mm`."""
         return _share([trial.error_mm < self.captured_mm for trial in self.at(offset)])
 
     def basin_share(self, offset: float) -> float:
-        """Share of the starts that end within ``captured_mm`` of where a start at the truth ends, biased or not."""
+        """Share of the starts that end within `captured_mm` of the result of a start at the truth."""
         return _share([trial.basin_mm < self.captured_mm for trial in self.at(offset)])
 
     def table(self) -> str:
-        """A Markdown table, a row an offset.
+        """Markdown table with one row per offset.
 
         >>> trials = CaptureTrial(5.0, 7.1, 0.04, 0.01, 0.9, 2.0), CaptureTrial(5.0, 6.5, 3.0, 3.0, 0.2, 2.0)
         >>> print(CaptureStudy(trials).table())
@@ -115,26 +115,26 @@ def capture_study(
     captured_mm: float = CAPTURED_MM,
     on_trial: Callable[[CaptureTrial], None] = lambda trial: None,
 ) -> CaptureStudy:
-    """How many random starts the rigid stages of a registration bring home, at each offset.
+    """Run the rigid stages of a registration from random starts at each offset.
 
-    The simulated plate has moved but is not bent, so that its true pose is rigid: a bent one would have a rigid optimum
-    that depends on the similarity. Only the stages of one group run. The error is the RMS distance of the implant's
-    nodes from their true places.
+    The simulated plate has moved but is not bent, so its true pose is rigid. (The rigid optimum of a bent plate would
+    depend on the similarity measure.) Only the stages with one group run. The error is the RMS distance of the
+    implant's nodes from their true positions.
 
     Args:
-        offsets: How far the starts are off: so many mm in a random direction, and so many degrees about a random axis
-            through the implant's centre, both at once.
-        num_starts: Starts at each offset.
+        offsets: Start errors: so many mm in a random direction together with so many degrees about a random axis
+            through the implant's centre.
+        num_starts: Number of starts at each offset.
         views: Views of the simulated scan, see `torchkcreg.simulation.weight_bearing_case`.
-        config: Options whose rigid stages run; the defaults with the implant's material when None.
-        known: The registration is told the screws.
+        config: Registration options, of which the rigid stages run; the defaults with the implant's material if None.
+        known: Give the screws to the registration.
         seed: Seed of the noise, the starts and the optimiser.
         binning: Pixels along each side that are binned into one before anything else.
         captured_mm: Error below which a start counts as captured.
         on_trial: Called after each registration.
 
     Raises:
-        ValueError: If no offset or start is asked for, or the configuration has no stage of one group.
+        ValueError: If there is no offset, an offset is negative, there is no start, or no stage has one group.
     """
     if not offsets or num_starts < 1 or not all(math.isfinite(offset) and offset >= 0 for offset in offsets):
         raise ValueError(f"offsets must be one or more, not negative, each with a start, got {offsets}, {num_starts}")
@@ -178,10 +178,10 @@ def capture_study(
 
 
 def rigid_stages(config: RegistrationConfig) -> RegistrationConfig:
-    """The configuration with its stages of one group alone.
+    """The configuration restricted to its rigid stages (one group).
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no rigid stage.
     """
     stages: tuple[Stage, ...] = tuple(stage for stage in config.schedule() if stage.level.is_rigid)
     if not stages:
@@ -192,14 +192,14 @@ def rigid_stages(config: RegistrationConfig) -> RegistrationConfig:
 def registration_inputs(
     case: SimulatedCase, pitch_mm: float = 0.25
 ) -> tuple[RegistrationData, ImplantPointCloud, list[Component]]:
-    """Projections, implant and screws of a simulated case as a registration takes them."""
+    """Projections, implant and screws of a simulated case, as inputs of a registration."""
     lines, mask = line_integrals_from_intensity(case.intensity, case.open_beam, saturation=case.saturation)
     screws = [Component.of(screw, pitch=pitch_mm) for screw in case.screws]
     return RegistrationData(case.geometry, lines, mask), ImplantPointCloud.from_mesh(case.implant, pitch_mm), screws
 
 
 def random_pose(pose: Tensor, offset: float, center: Tensor, generator: torch.Generator) -> Tensor:
-    """A pose (4, 4) off by ``offset`` mm and ``offset`` degrees about ``center`` (3,) of the implant's frame."""
+    """Pose (4, 4) off by `offset` mm and `offset` degrees about `center` (3,) of the implant's frame."""
     turn, shift = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
     motion = rotation_about(center, turn * math.radians(offset))
     motion[:3, 3] += offset * shift

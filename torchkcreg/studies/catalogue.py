@@ -1,4 +1,4 @@
-"""The studies by their names: which jobs each has, what runs them, what their rows say."""
+"""Catalogue of the studies: the jobs of each, the function that runs a job, and the report."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _VIEWS = 3
 
 @dataclass(frozen=True)
 class StudyOptions:
-    """What a study is run on.
+    """Settings of a study.
 
     Attributes:
-        cases: How many cases of the population; None: as many as the study usually has.
-        first: Seed of the first one.
-        views: "neighbours", "around", "both" or "spread"; studies of coverage and views have their own.
-        known: Screws and spectrum are told; in studies of geometry and views they always are.
-        elastic: Plates bend under known loads.
-        images: "own", or those of another case, "mirrored", "turned".
-        options: Of the registration.
-        cache: Folder that keeps images.
+        cases: Number of simulated cases; None: the study's default.
+        first: Seed of the first case.
+        views: "neighbours", "around", "both" or "spread". The studies of coverage and views choose their own views.
+        known: Give screws and spectrum to the registration. The studies of geometry and views always do.
+        elastic: Plates bend elastically under known loads.
+        images: "own" for the case's images, or wrong ones: those of another case, "mirrored", "turned".
+        options: Options of the registration.
+        cache: Folder in which simulated images are cached.
     """
 
     cases: int | None = None
@@ -47,25 +47,25 @@ class StudyOptions:
     cache: str = ""
 
     def seeds(self, usual: int) -> range:
-        """Of the cases."""
+        """Seeds of the cases."""
         return range(self.first, self.first + (usual if self.cases is None else self.cases))
 
     def job(self, seed: int, **changes: Any) -> Job:
-        """A job of :func:`simulated`."""
+        """A job for `simulated`."""
         names = ("views", "known", "elastic", "images", "options", "cache")
         return {"seed": seed, "geometry": "none", **{name: getattr(self, name) for name in names}, **changes}
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study.
+    """Definition of a study.
 
     Attributes:
-        text: What it asks.
-        jobs: Of options.
-        function: Runs one.
-        report: What all rows say; writes table and figures to a folder.
-        fixed: Names of options that the study sets itself, or has no use for.
+        text: Question of the study, one line.
+        jobs: Function that lists the jobs for given options.
+        function: Function that runs one job and returns its row.
+        report: Function that summarises all rows in words and writes table and figures to a folder.
+        fixed: Names of options that the study sets itself or does not use.
     """
 
     text: str
@@ -75,7 +75,7 @@ class Study:
     fixed: tuple[str, ...] = ()
 
     def check(self, name: str, options: StudyOptions) -> None:
-        """Raises ValueError if options ask for what the study, of this name, would not do."""
+        """Raise ValueError if `options` set an option that is fixed in the study called `name`."""
         usual = StudyOptions()
         if asked := [option for option in self.fixed if getattr(options, option) != getattr(usual, option)]:
             raise ValueError(f"the study {name} has its own {' and '.join(asked)}: none can be chosen")
@@ -84,19 +84,20 @@ class Study:
 def run_study(
     name: str, options: StudyOptions, out: Path, *, workers: int = 2, cluster: str | None = None
 ) -> tuple[list[Row], str]:
-    """Rows of a study and what they say; the folder then holds `jobs.jsonl`, a table and figures.
+    """Run a study and return its rows and a summary in words.
 
-    Finished jobs are kept: started again, the study goes on where it was broken off.
+    The folder then holds `jobs.jsonl`, a table and figures. Finished jobs are kept: a study that is started again
+    continues where it stopped.
 
     Args:
-        name: Of one of :data:`STUDIES`.
-        options: What it is run on.
-        out: Folder; it is made.
-        workers: See :func:`sweep`.
-        cluster: See :func:`sweep`.
+        name: A key of `STUDIES`.
+        options: Settings of the study.
+        out: Output folder, created if missing.
+        workers: See `sweep`.
+        cluster: See `sweep`.
 
     Raises:
-        ValueError: If there is no such study or case, an option has no use in it, or the rows of all jobs are errors.
+        ValueError: If there is no such study, there are no cases, an option is fixed in the study, or all jobs failed.
     """
     if name not in STUDIES:
         raise ValueError(f"there is no study {name!r}: there are {', '.join(STUDIES)}")
@@ -109,8 +110,8 @@ def run_study(
     errors = [row["error"] for row in rows if "error" in row]
     if len(errors) == len(rows):
         raise ValueError(f"all {len(rows)} jobs failed, the first with {errors[0]}")
-    told = study.report(rows, out)
-    return rows, f"{told}\n{len(errors)} jobs failed, the first with {errors[0]}" if errors else told
+    summary = study.report(rows, out)
+    return rows, f"{summary}\n{len(errors)} jobs failed, the first with {errors[0]}" if errors else summary
 
 
 def _population(options: StudyOptions) -> list[Job]:
@@ -123,22 +124,22 @@ def _coverage(options: StudyOptions) -> list[Job]:
 
 
 def covered(job: Job) -> Row:
-    """A row that knows its set of views."""
+    """Row of a simulated case with its set of views."""
     return {**simulated(job), "views": job["views"]}
 
 
 def _geometry(options: StudyOptions) -> list[Job]:
-    ways = [{**options.options, "view_motion": way} for way in ("off", "auto")]
+    option_sets = [{**options.options, "view_motion": way} for way in ("off", "auto")]
     return [
         options.job(seed, geometry=error, known=True, options=way)
         for seed in options.seeds(12)
         for error in ("none", *ERRORS, "all")
-        for way in ways
+        for way in option_sets
     ]
 
 
 def corrected(job: Job) -> Row:
-    """A row that knows what was wrong, and whether views were moved."""
+    """Row of a case with the error of its geometry and whether the registration moved views."""
     row = simulated(job)
     moved = row["view_motion_mm"] is not None
     return {**row, "geometry": job["geometry"], "view_motion": job["options"]["view_motion"], "views_moved": moved}
@@ -150,19 +151,19 @@ def _views(options: StudyOptions) -> list[Job]:
 
 
 def planned(job: Job) -> Row:
-    """Registered to three views of many: the set that is planned, or, by its number, a random one."""
+    """Row of a case registered to three of many views: the planned set, or a random set given by its number."""
     draw = draw_case(job["seed"])
     case = made_case(draw, job["views"], job["elastic"], job["cache"])
     config = RegistrationConfig(material=case.implant_material, **job["options"])
     _, cloud, screws = registration_inputs(case, config.pitch_mm)
     scene = build_scene(cloud, config, spectrum=case.spectrum, components=screws)
-    known = view_information(scene, case.geometry, config)
+    information = view_information(scene, case.geometry, config)
     if job["random"] is None:
-        chosen = list(known.best(_VIEWS)[0].views)
+        chosen = list(information.best(_VIEWS)[0].views)
     else:
         generator = torch.Generator().manual_seed(1000 * job["seed"] + job["random"])
         chosen = torch.randperm(case.geometry.num_views, generator=generator)[:_VIEWS].tolist()
-    expected = float(known.expected(torch.tensor([chosen]))[0])
+    expected = float(information.expected(torch.tensor([chosen]))[0])
     row = registered(job, draw, case, chosen=chosen)
     return {**row, "chosen": chosen, "expected_mm": round(expected, 4), "planned": job["random"] is None}
 
@@ -173,14 +174,16 @@ def _loads(options: StudyOptions) -> list[Job]:
 
 STUDIES = {
     "population": Study("errors and verdicts of randomly drawn cases", _population, simulated, of_population),
-    "coverage": Study("how often error bars hold the truth", _coverage, covered, of_coverage, ("views",)),
-    "geometry": Study("what a geometry that is off costs, and what is won back", _geometry, corrected, of_geometry),
+    "coverage": Study("how often error bars contain the truth", _coverage, covered, of_coverage, ("views",)),
+    "geometry": Study(
+        "errors from a wrong geometry, and how much moving the views recovers", _geometry, corrected, of_geometry
+    ),
     "loads": Study(
-        "loads in newton, views and noise, on the tibial plate",
+        "errors for loads in newton, sets of views and noise levels, on the tibial plate",
         _loads,
         registered_load,
         of_loads,
         ("views", "elastic", "images", "cache"),
     ),
-    "views": Study("whether planned views beat random ones", _views, planned, of_views, ("views",)),
+    "views": Study("planned views against random ones", _views, planned, of_views, ("views",)),
 }

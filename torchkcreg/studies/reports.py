@@ -1,4 +1,4 @@
-"""What the rows of a study say, in words, and the figures that show it."""
+"""Reports of the studies: summaries of their rows in words, tables and figures."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from .sweeps import Row
 
 WRONG_MM, RIGHT_MM = 0.15, 0.10
 _SETS = {"neighbours": "three views a degree apart", "around": "six views around the limb"}
-_WAYS = {"off": "as told", "auto": "views may move"}
+_WAYS = {"off": "views fixed", "auto": "views may move"}
 
 
 def of_population(rows: Sequence[Row], folder: Path) -> str:
-    """Errors and verdicts, how often error bars hold the truth and, where loads are known, how well they are found."""
+    """Report errors, verdicts, coverage of the error bars and, if the loads are known, errors of the moments."""
     whole = [row for row in rows if "error" not in row]
     write_rows(folder / "population.csv", rows)
     lines = [errors_in_words(rows)]
@@ -43,26 +43,27 @@ def of_population(rows: Sequence[Row], folder: Path) -> str:
 
 
 def errors_in_words(rows: Sequence[Row]) -> str:
-    """The figures that matter, in one line; a registration that raised an error counts as far off, and said so."""
-    worst = np.array([np.inf if row.get("worst") is None else row["worst"] for row in rows])  # JSON has no infinity
+    """Main figures in one line. A registration that raised an error counts as a large error with a warning."""
+    # an infinite error is None in JSON
+    worst = np.array([np.inf if row.get("worst") is None else row["worst"] for row in rows])
     nodes = np.array([row.get("nodes", np.inf) for row in rows])
-    said = np.array(["error" in row or row["status"] != "ok" or bool(row["warnings"]) for row in rows])
+    flagged = np.array(["error" in row or row["status"] != "ok" or bool(row["warnings"]) for row in rows])
     seeds = np.array([row.get("seed", -1) for row in rows])
-    silent, idle = seeds[~said & (worst > WRONG_MM)].tolist(), seeds[said & (worst < RIGHT_MM)].tolist()
+    silent, false_alarms = seeds[~flagged & (worst > WRONG_MM)].tolist(), seeds[flagged & (worst < RIGHT_MM)].tolist()
     seconds = np.median([row.get("seconds", np.nan) for row in rows])
     return (
         f"{len(rows)} cases: node RMSE median {np.median(nodes):.3f}, worst figure median {np.median(worst):.3f}, "
         f"90th percentile {np.percentile(worst, 90):.3f} mm; {int((worst < RIGHT_MM).sum())} below {RIGHT_MM} mm; "
-        f"silent failures {len(silent)} {silent}; idle alarms {len(idle)} {idle}; {seconds:.0f} s"
+        f"silent failures {len(silent)} {silent}; false alarms {len(false_alarms)} {false_alarms}; {seconds:.0f} s"
     )
 
 
 def of_coverage(rows: Sequence[Row], folder: Path) -> str:
-    """Shares of true positions within 68 % and 95 % intervals, averaged over cases, of each set of views."""
+    """Report the share of true positions within 68 % and 95 % intervals, averaged over cases, by set of views."""
     sets = {}
     for views in dict.fromkeys(row.get("views", "neighbours") for row in rows):
-        own = [row["coverage"] for row in rows if row.get("views", "neighbours") == views]
-        sets[views] = (len(own), {name: np.mean([one[name] for one in own], axis=0) for name in own[0]})
+        shares = [row["coverage"] for row in rows if row.get("views", "neighbours") == views]
+        sets[views] = (len(shares), {name: np.mean([share[name] for share in shares], axis=0) for name in shares[0]})
     curves = {f"{_SETS.get(views, views)} ({n} cases)": parts for views, (n, parts) in sets.items()}
     write_figure(folder / "coverage.png", coverage_figure(WIDTHS, curves), dpi=110)
     header = ["true positions within 68 %, 95 % intervals", *next(iter(sets.values()))[1]]
@@ -74,9 +75,9 @@ def of_coverage(rows: Sequence[Row], folder: Path) -> str:
 
 
 def loads_in_words(rows: Sequence[Row], place: str) -> str:
-    """How well bending moments are found at a place, and how often their intervals hold them."""
-    true, found, std = (np.array([row[f"{place}_{name}"] for row in rows], dtype=float) for name in MOMENTS)
-    error = np.abs(found - true)
+    """Errors of the bending moments at a place, and how often the true moment is within its interval."""
+    true, estimated, std = (np.array([row[f"{place}_{name}"] for row in rows], dtype=float) for name in MOMENTS)
+    error = np.abs(estimated - true)
     within = error <= np.maximum(0.05 * np.abs(true), 50.0)
     return (
         f"bending moments, {place}, of {len(rows)}: error median {np.median(error):.0f} N mm, "
@@ -87,33 +88,35 @@ def loads_in_words(rows: Sequence[Row], place: str) -> str:
 
 
 def of_geometry(rows: Sequence[Row], folder: Path) -> str:
-    """What errors of the geometry cost, and what is won back where views may move."""
+    """Report errors caused by a wrong geometry, with views fixed and with views that may move."""
     write_rows(folder / "geometry.csv", rows)
     rows = [row for row in rows if "error" not in row]
     names = list(dict.fromkeys(row["geometry"] for row in rows))
-    of = {
+    by_error = {
         name: {way: [r for r in rows if (r["geometry"], r["view_motion"]) == (name, way)] for way in _WAYS}
         for name in names
     }
     errors = {
-        title: {name: {way: [r[key] for r in own] for way, own in ways.items()} for name, ways in of.items()}
+        title: {
+            name: {way: [r[key] for r in selected] for way, selected in ways.items()} for name, ways in by_error.items()
+        }
         for key, title in (("nodes", "where the nodes are"), ("shape", "how the implant is bent"))
     }
     write_figure(folder / "geometry.png", geometry_figure(errors, _WAYS), dpi=110)
     header = ["geometry off", "cases", *(f"{words}: nodes, shape (median, mm)" for words in _WAYS.values()), "moved"]
     table = []
-    for name, own in of.items():
+    for name, selected in by_error.items():
         cells = [
-            f"{np.median([r['nodes'] for r in some]):.3f}, {np.median([r['shape'] for r in some]):.3f}"
-            for some in own.values()
+            f"{np.median([r['nodes'] for r in group]):.3f}, {np.median([r['shape'] for r in group]):.3f}"
+            for group in selected.values()
         ]
-        moved = sum(bool(r["views_moved"]) for r in own["auto"])
-        table.append([name, str(len(own["off"])), *cells, f"{moved} of {len(own['auto'])}"])
+        moved = sum(bool(r["views_moved"]) for r in selected["auto"])
+        table.append([name, str(len(selected["off"])), *cells, f"{moved} of {len(selected['auto'])}"])
     return markdown_table(header, table)
 
 
 def of_loads(rows: Sequence[Row], folder: Path) -> str:
-    """Median errors for each load, set of views and number of quanta."""
+    """Report median errors for each load, set of views and number of quanta."""
     write_rows(folder / "loads.csv", rows)
     rows = [row for row in rows if "error" not in row]
     kinds = sorted({(int(row["views"]), row["photons"]) for row in rows})
@@ -134,18 +137,18 @@ def of_loads(rows: Sequence[Row], folder: Path) -> str:
 
 
 def of_views(rows: Sequence[Row], folder: Path) -> str:
-    """How often planned sets of views beat random ones."""
+    """Report how often planned sets of views beat random ones."""
     write_rows(folder / "views.csv", rows)
     rows = [row for row in rows if "error" not in row]
     planned = {row["seed"]: row["nodes"] for row in rows if row["planned"]}
     random = [row for row in rows if not row["planned"] and row["seed"] in planned]
     won = sum(planned[row["seed"]] < row["nodes"] for row in random)
-    expected, found = ([row[name] for row in rows] for name in ("expected_mm", "nodes"))
-    write_figure(folder / "views.png", planned_figure(expected, found, [row["planned"] for row in rows]), dpi=110)
-    correlation = float(np.corrcoef(np.log(expected), np.log(found))[0, 1])
+    expected, actual = ([row[name] for row in rows] for name in ("expected_mm", "nodes"))
+    write_figure(folder / "views.png", planned_figure(expected, actual, [row["planned"] for row in rows]), dpi=110)
+    correlation = float(np.corrcoef(np.log(expected), np.log(actual))[0, 1])
     best, others = (np.median([row["nodes"] for row in rows if row["planned"] == chosen]) for chosen in (True, False))
     return (
         f"planned sets of three beat random ones in {won} of {len(random)} draws, {len(planned)} cases: nodes "
         f"{best:.3f} against {others:.3f} mm (median); "
-        f"correlation of log expected and log found error {correlation:.2f}"
+        f"correlation of log expected and log actual error {correlation:.2f}"
     )

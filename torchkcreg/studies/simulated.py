@@ -1,4 +1,4 @@
-"""One simulated case of the population, registered: errors in mm, and what the registration says of itself."""
+"""Register one simulated case of the population and measure its errors in mm and the registration's diagnostics."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ MOMENTS = ("true", "found", "std")
 
 
 def wrong_geometry(geometry: ConeBeamGeometry, nodes: Tensor, error: str, seed: int) -> ConeBeamGeometry:
-    """The geometry that a registration is told where the scan was made with another.
+    """A wrong geometry to be given to a registration in place of the true one.
 
-    Errors are independent in each view and sum to nothing over all: what views have in common moves the implant, which
-    no image tells from a scanner that stands elsewhere.
+    The errors are independent between views and their mean over the views is zero. A common error would only move the
+    implant, which the images cannot distinguish from a displaced scanner.
 
     Args:
-        geometry: Of the images.
-        nodes: World positions (N, 3) of the implant.
-        error: "detector": 0.3 pixels along rows and columns; "source": 0.2 mm along each axis; "limb": a rigid motion
-            between views that moves nodes by 0.3 mm, root mean square; "all" of them; "none".
-        seed: Of the random numbers.
+        geometry: True geometry of the images.
+        nodes: World positions (N, 3) of the implant's nodes.
+        error: "detector": shift by 0.3 pixels along rows and columns; "source": shift by 0.2 mm along each axis;
+            "limb": rigid motion between views that moves the nodes by 0.3 mm RMS; "all" of them; "none".
+        seed: Seed of the random errors.
 
     Raises:
-        ValueError: If there is no such error.
+        ValueError: If the error has none of these names.
     """
     if error not in ("none", "all", *ERRORS):
         raise ValueError(f"error must be one of none, {', '.join(ERRORS)}, all, got {error!r}")
@@ -62,7 +62,8 @@ def wrong_geometry(geometry: ConeBeamGeometry, nodes: Tensor, error: str, seed: 
         matrices = torch.stack([with_source(*view) for view in moved])
     if error in ("limb", "all"):
         limb = ViewMotions(nodes, number, 1.0)
-        limb.values.copy_(ERRORS["limb"] / math.sqrt(5) * motions)  # about its long axis a plate hardly moves
+        # 5, not 6 motions: a rotation about its long axis hardly moves a plate
+        limb.values.copy_(ERRORS["limb"] / math.sqrt(5) * motions)
         matrices = matrices @ limb.matrices()
     return ConeBeamGeometry(
         matrices,
@@ -74,7 +75,7 @@ def wrong_geometry(geometry: ConeBeamGeometry, nodes: Tensor, error: str, seed: 
 
 
 def with_source(matrix: Tensor, distance: float, shift: Tensor) -> Tensor:
-    """The projection matrix (3, 4) after its source has moved by (3,) mm while the detector, so far off, stays."""
+    """Projection matrix (3, 4) with the source moved by `shift` (3,) mm; the detector at `distance` stays in place."""
     inverse = torch.linalg.inv(matrix[:, :3])
     source = shift - inverse @ matrix[:, 3]
     inverse[:, 2] -= shift / distance
@@ -83,22 +84,22 @@ def with_source(matrix: Tensor, distance: float, shift: Tensor) -> Tensor:
 
 
 def simulated(job: Job) -> Row:
-    """The row of a simulated case.
+    """Simulate and register one case, and return its row.
 
     Args:
-        job: `seed` of the case; `views` ("neighbours", "around", "both", "spread" or "many"); `elastic`: it bends under
-            known loads; `known`: screws and spectrum are told; `geometry`: how it is off, see `wrong_geometry`;
-            `images`: "own", or those of another case, "mirrored", "turned"; `options` of the registration; `cache`:
-            folder that keeps images.
+        job: `seed` of the case; `views` ("neighbours", "around", "both", "spread" or "many"); `elastic`: the plate
+            bends under known loads; `known`: screws and spectrum are given to the registration; `geometry`: error of
+            the geometry, see `wrong_geometry`; `images`: "own", or wrong ones: those of another case, "mirrored",
+            "turned"; `options` of the registration; `cache`: folder of cached images.
     """
     draw = draw_case(job["seed"])
     return registered(job, draw, made_case(draw, job["views"], job["elastic"], job["cache"]))
 
 
 def registered(job: Job, draw: Draw, case: SimulatedCase, *, chosen: list[int] | None = None) -> Row:
-    """The row of a case that is there, registered to all of its views or to those that are chosen.
+    """Register a case to all of its views, or to the chosen ones, and return its row.
 
-    Images that do not show the implant where the geometry has it have no right answer: the worst error is infinite.
+    With wrong images (not "own") there is no correct result: the worst error is infinite.
     """
     config = RegistrationConfig(material=case.implant_material, **job["options"])
     data, cloud, screws = registration_inputs(case, config.pitch_mm)
@@ -138,37 +139,37 @@ def registered(job: Job, draw: Draw, case: SimulatedCase, *, chosen: list[int] |
 
 
 def made_case(draw: Draw, views: Any, elastic: bool, cache: str) -> SimulatedCase:
-    """The case, its images out of a folder that keeps them, if there is one."""
-    kept = Path(cache) / f"{'elastic-' if elastic else ''}{views}-{draw.seed}.npy" if cache else None
-    counts = read_array(kept) if kept is not None and kept.exists() else None
+    """The simulated case of a draw. Its images are read from, or written to, the cache folder if one is given."""
+    cached = Path(cache) / f"{'elastic-' if elastic else ''}{views}-{draw.seed}.npy" if cache else None
+    counts = read_array(cached) if cached is not None and cached.exists() else None
     case = random_case(draw, views=views, elastic=elastic, counts=counts)
-    if kept is not None and counts is None:
-        write_array(kept, case.intensity)
+    if cached is not None and counts is None:
+        write_array(cached, case.intensity)
     return case
 
 
 def _unrelated(draw: Draw, data: RegistrationData, images: str) -> dict[str, Any]:
-    """Line integrals and geometry of images that do not show the case's implant where the geometry has it."""
+    """Wrong line integrals, mask and geometry: mirrored, turned by 180 degrees, or those of another case."""
     if images == "mirrored":
         return {"line_integrals": data.line_integrals.flip(-1), "mask": data.mask.flip(-1)}
     if images == "turned":
         return {"line_integrals": data.line_integrals.flip(-2, -1), "mask": data.mask.flip(-2, -1)}
-    other = random_case(draw_case(draw.seed + 1000))
-    lines, mask = line_integrals_from_intensity(other.intensity.float(), other.open_beam)
-    return {"line_integrals": lines, "mask": mask, "geometry": other.geometry}
+    other_case = random_case(draw_case(draw.seed + 1000))
+    lines, mask = line_integrals_from_intensity(other_case.intensity.float(), other_case.open_beam)
+    return {"line_integrals": lines, "mask": mask, "geometry": other_case.geometry}
 
 
 def errors_of(implant: RegisteredImplant, case: SimulatedCase, nodes: Tensor, truth: Tensor) -> Row:
-    """Errors in mm: root mean squares of nodes and beads, of the nodes' shape, along the rays; the largest figure."""
-    found = implant.warp(nodes)
-    errors, still = found - truth, torch.zeros_like(nodes)
+    """Errors in mm: RMS of beads, of nodes, of nodes after rigid alignment and along the rays; the worst figure."""
+    estimated = implant.warp(nodes)
+    errors, zeros = estimated - truth, torch.zeros_like(nodes)
     ray = case.geometry.source_positions.double().mean(0) - nodes.mean(0)
     beads = float(bb_rmse(implant.warp(case.beads_before.double()), case.beads_after.double()))
-    node, largest = float(bb_rmse(errors, still)), float(errors.norm(dim=-1).max()) / 3
+    node, largest = float(bb_rmse(errors, zeros)), float(errors.norm(dim=-1).max()) / 3
     figures = {
         "beads": beads,
         "nodes": node,
-        "shape": float(bb_rmse(transform_points(fit_rigid(found, truth), found), truth)),
+        "shape": float(bb_rmse(transform_points(fit_rigid(estimated, truth), estimated), truth)),
         "largest_third": largest,
         "worst": max(beads, node, largest),
         "depth": float((errors @ (ray / ray.norm())).square().mean().sqrt()),
@@ -179,45 +180,51 @@ def errors_of(implant: RegisteredImplant, case: SimulatedCase, nodes: Tensor, tr
 
 
 def coverage_of(implant: RegisteredImplant, case: SimulatedCase, nodes: Tensor, errors: Tensor) -> dict[str, list]:
-    """Which share of true positions lies within so many stated deviations, for each of `WIDTHS`."""
-    known = implant.deviations
-    if known is None:
+    """Share of true positions within each multiple (`WIDTHS`) of the stated standard deviation."""
+    deviations = implant.deviations
+    if deviations is None:
         return {}
     beads = case.beads_before.double()
     off = {"nodes": (nodes, errors), "beads": (beads, implant.warp(beads) - case.beads_after.double())}
-    _, axes = torch.linalg.eigh(torch.outer(known.depth, known.depth))
-    parts = {"lateral": (axes[:, 0], axes[:, 1]), "depth": (known.depth,)}
-    found = {}
+    _, axes = torch.linalg.eigh(torch.outer(deviations.depth, deviations.depth))
+    parts = {"lateral": (axes[:, 0], axes[:, 1]), "depth": (deviations.depth,)}
+    shares = {}
     for name, (points, error) in off.items():
-        spread = known.covariance(points)
+        spread = deviations.covariance(points)
         for part, directions in parts.items():
             sizes = [(error @ d).abs() / torch.einsum("i,nij,j->n", d, spread, d).sqrt() for d in directions]
             size = torch.cat(sizes)
-            found[f"{name} {part}"] = [round(float((size <= width).double().mean()), 4) for width in WIDTHS]
-    return found
+            shares[f"{name} {part}"] = [round(float((size <= width).double().mean()), 4) for width in WIDTHS]
+    return shares
 
 
 def load_errors(case: SimulatedCase, deformation: Deformation) -> Row:
-    """Bending moments in N mm: the true one, what was found, its deviation.
+    """Bending moments in N mm: true value, estimate and standard deviation.
 
-    In the middle between the fragments and where it is largest, each in the direction in which the plate is bent more.
+    They are evaluated midway between the fragments and where the true moment is largest, about the axis with the larger
+    true moment.
     """
     carried = case.carried
     if carried is None or not isinstance(deformation, FiniteElementDeformation):
         return {}
-    found = CarriedLoad.of(
+    estimated = CarriedLoad.of(
         deformation.superelement, deformation.amounts.detach(), deformation.covariance, deformation.expected
     )
-    signs = (found.axes @ carried.axes.mT).diagonal().sign()[:2]  # a lattice's axes may point the other way
-    true, moments, std = carried.section_loads[:, 3:5], signs * found.section_loads[:, 3:5], found.section_std[:, 3:5]
+    # the axes of the two lattices may have opposite signs
+    signs = (estimated.axes @ carried.axes.mT).diagonal().sign()[:2]
+    true, moments, std = (
+        carried.section_loads[:, 3:5],
+        signs * estimated.section_loads[:, 3:5],
+        estimated.section_std[:, 3:5],
+    )
     size = carried.hold_loads.abs().amax(0)
     used = carried.hold_heights[(carried.hold_loads.abs() > 1e-3 * size).any(1)]
     middle = carried.heights[-1] / 2
     gap = (used[used < middle].max() + used[used > middle].min()) / 2
     places = {"gap": int((carried.heights - gap).abs().argmin()), "largest": int(true.abs().amax(1).argmax())}
     rows: Row = {}
-    for name, at in places.items():
-        axis = int(true[at].abs().argmax())
-        values = (float(x[at, axis]) for x in (true, moments, std))
+    for name, index in places.items():
+        axis = int(true[index].abs().argmax())
+        values = (float(x[index, axis]) for x in (true, moments, std))
         rows |= {f"{name}_{key}": round(value) for key, value in zip(MOMENTS, values, strict=True)}
     return rows

@@ -1,4 +1,4 @@
-"""Many runs of one function, in parallel, each finished one kept: what was broken off goes on where it stopped."""
+"""Run one function on many jobs in parallel. Finished jobs are saved, so that a stopped sweep can be continued."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchkcreg.progress import progress_bar
 Job = dict[str, Any]
 Row = dict[str, Any]
 
-_SECONDS = 10  # to find a cluster
+_SECONDS = 10  # timeout for connecting to a cluster
 
 
 def sweep(
@@ -31,64 +31,66 @@ def sweep(
     cluster: str | None = None,
     on_row: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
-    """Rows of all jobs, in their order; those that the table already holds are not run again.
+    """Run all jobs and return their rows in the order of the jobs. Jobs already in the table are not run again.
 
-    A job that fails with a ValueError or RuntimeError has a row with its `error` alone, and is tried again when the
-    sweep is started again. Rows come to the table as they are made, so that a killed sweep loses no finished one.
+    The row of a job that fails with a ValueError or RuntimeError holds only its `error`, and the job is run again when
+    the sweep is restarted. Each row is written to the table at once, so a killed sweep loses no finished job.
 
     Args:
-        function: Of a module, so that other processes find it; what it gives is written as JSON.
-        jobs: Its arguments, plain types; two alike are one.
-        table: File of JSON lines, each a job and its row; it is made.
-        workers: Processes on this machine, a thread each. One runs here.
-        cluster: Address of a Dask scheduler whose workers run the jobs in their place.
-        on_row: Hears each row that is made.
+        function: Function defined in a module, so that other processes can import it. Its row is written as JSON.
+        jobs: Arguments of the function, plain types. Identical jobs are run once.
+        table: File of JSON lines, each a job and its row; created if missing.
+        workers: Number of processes on this machine, with one thread each. A single worker is this process itself.
+        cluster: Address of a Dask scheduler whose workers run the jobs instead.
+        on_row: Called with each new row.
 
     Raises:
-        ValueError: If more than one worker, or a cluster, is asked for and joblib or Dask is not installed; if the
-            table is no such file.
+        ValueError: If more than one worker or a cluster needs joblib or Dask, which is not installed, or the table is
+            not a file written by `sweep`.
     """
-    kept, version = read_table(table), importlib.metadata.version("torchkcreg")
-    left = [job for key, job in {_key(job): job for job in jobs}.items() if "error" in kept.get(key, {"error": ""})]
-    rows = _made(function, left, workers, cluster)
-    for job, row in progress_bar(rows, total=len(left), desc=table.stem, shown=True):
-        kept[_key(job)] = plain(row)
+    rows_by_job, version = read_table(table), importlib.metadata.version("torchkcreg")
+    remaining = [
+        job for key, job in {_key(job): job for job in jobs}.items() if "error" in rows_by_job.get(key, {"error": ""})
+    ]
+    rows = _made(function, remaining, workers, cluster)
+    for job, row in progress_bar(rows, total=len(remaining), desc=table.stem, shown=True):
+        rows_by_job[_key(job)] = plain(row)
         append_line(table, json.dumps({"job": job, "row": plain(row), "version": version}))
         on_row(row)
-    return [kept[_key(job)] for job in jobs]
+    return [rows_by_job[_key(job)] for job in jobs]
 
 
 def read_table(table: Path) -> dict[str, Row]:
-    """Rows of a sweep's table by their job; the last line, where it was broken off, is left out.
+    """Rows of a sweep's table, by job. A last line that is incomplete is removed from the file.
 
     Raises:
-        ValueError: If another line is malformed.
+        ValueError: If any other line is malformed.
     """
     lines = read_text(table, "table").splitlines() if table.exists() else []
-    found, versions = {}, set[str]()
+    rows, versions = {}, set[str]()
     for number, line in enumerate(lines, start=1):
         entry = _entry(line)
         if entry is None and number == len(lines):
-            write_text(table, "".join(f"{kept}\n" for kept in lines[:-1]))
+            write_text(table, "".join(f"{complete}\n" for complete in lines[:-1]))
         elif entry is None:
             raise ValueError(f"table {table}, line {number} is no job with its row: {line[:80]}")
         else:
-            found[_key(entry["job"])] = entry["row"]
+            rows[_key(entry["job"])] = entry["row"]
             versions.add(str(entry["version"]))
-    if others := sorted(versions - {importlib.metadata.version("torchkcreg")}):
-        warnings.warn(f"table {table} has rows that torchkcreg {', '.join(others)} made", stacklevel=3)
-    return found
+    if other_versions := sorted(versions - {importlib.metadata.version("torchkcreg")}):
+        warnings.warn(f"table {table} has rows that torchkcreg {', '.join(other_versions)} made", stacklevel=3)
+    return rows
 
 
 def _entry(line: str) -> dict[str, Any] | None:
-    """A job with its row and the version that made it; None where a line holds none."""
+    """Job, row and version from a line of the table; None if the line is malformed."""
     try:
         entry = json.loads(line)
     except ValueError:
         return None
     kinds = {"job": dict, "row": dict, "version": str}
-    whole = isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
-    return entry if whole else None
+    is_valid = isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
+    return entry if is_valid else None
 
 
 def _key(job: Job) -> str:
@@ -98,7 +100,7 @@ def _key(job: Job) -> str:
 def _made(
     function: Callable[[Job], Row], jobs: Sequence[Job], workers: int, cluster: str | None
 ) -> Iterator[tuple[Job, Row]]:
-    """Jobs and their rows as they are made."""
+    """Yield each job with its row as soon as it is finished."""
     if workers == 1 and cluster is None:
         yield from (_one(function, job) for job in jobs)
         return
@@ -119,11 +121,11 @@ def _made(
             yield future.result()
 
 
-def _installed(package: str, asked: str) -> Any:
+def _installed(package: str, purpose: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError:
-        raise ValueError(f"{asked} needs {package}: pip install 'torchkcreg[studies]'") from None
+        raise ValueError(f"{purpose} needs {package}: pip install 'torchkcreg[studies]'") from None
 
 
 def _on_one_thread(function: Callable[[Job], Row], job: Job) -> tuple[Job, Row]:

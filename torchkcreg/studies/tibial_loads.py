@@ -1,4 +1,4 @@
-"""The tibial plate under a load, imaged with so many quanta and registered from so many views."""
+"""Study of the tibial plate under several loads, numbers of quanta and sets of views."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from .sweeps import Job, Row
 
 LOADS_N = (0.0, 200.0, 400.0, 600.0, 800.0, 1000.0)
 VIEWS = ("3", "12")
-PHOTONS = (5e3, 2e4)  # a pixel of the open beam
-_SHIFT_MM, _TURN_DEG = 0.8, 0.5  # standard deviations of where the limb stands
+PHOTONS = (5e3, 2e4)  # quanta per pixel of the open beam
+_SHIFT_MM, _TURN_DEG = 0.8, 0.5  # standard deviations of the limb's position
 _NODES_COARSER = 4
 
 
 def load_jobs(seeds: range, *, known: bool, options: dict[str, object]) -> list[Job]:
-    """Every load with every set of views, number of quanta and seed."""
+    """Jobs for all combinations of seed, load, set of views and number of quanta."""
     return [
         {"seed": seed, "load_n": load, "views": views, "photons": photons, "known": known, "options": options}
         for seed in seeds
@@ -36,11 +36,11 @@ def load_jobs(seeds: range, *, known: bool, options: dict[str, object]) -> list[
 
 
 def registered_load(job: Job) -> Row:
-    """The row of a job: errors in mm, and what the registration says of itself.
+    """Simulate and register the tibial plate for one job, and return its row of errors in mm and diagnostics.
 
     Args:
-        job: `load_n`, `views` ("3" or "12", the paper's), `photons`, `seed` of noise and of where the limb stands,
-            `known`: screws and spectrum are told; `options` of the registration.
+        job: `load_n`; `views` ("3" or "12", the paper's); `photons`; `seed` of the noise and of the limb's position;
+            `known`: screws and spectrum are given to the registration; `options` of the registration.
     """
     recipe = recipe_of(job)
     made = specimen(recipe)
@@ -73,12 +73,12 @@ def registered_load(job: Job) -> Row:
 
 @cache
 def _construct() -> ElasticConstruct:
-    """The plate on its bone, made once in each process: it takes seconds."""
+    """Elastic model of the plate on its bone, built once per process because it takes seconds."""
     return ElasticConstruct(specimen(Recipe.of(packaged("tibial_plate"))))
 
 
 def recipe_of(job: Job) -> Recipe:
-    """The experiment of a job: the tibial plate's, but for load, quanta, views, and where the limb stands."""
+    """Recipe of a job: the tibial plate's, with the job's load, quanta, views and random position of the limb."""
     rng = np.random.default_rng([job["seed"], 41])
     shift, turn = (rng.normal(scale=scale, size=3).tolist() for scale in (_SHIFT_MM, _TURN_DEG))
     load = {"force": f"[0, 0, {-job['load_n']}] N", "translation": f"{shift} mm", "rotation": f"{turn} deg"}

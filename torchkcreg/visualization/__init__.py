@@ -1,6 +1,6 @@
-"""Figures of a registration: overlays, displacement and error maps, histograms, the course of the optimisation.
+"""Figures and the HTML report of registrations, reconstructions, plans of views and studies.
 
-Each function returns a matplotlib `Figure` of its own; nothing touches pyplot's state or a screen.
+Each figure function returns a new matplotlib `Figure`. pyplot's state and the screen are not used.
 """
 
 from .case import case_figure

@@ -1,4 +1,4 @@
-"""Simulated images side by side."""
+"""Figure of a simulated case: some of its views side by side."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _BRIGHTEST = 0.998  # dead pixels are brighter
 
 
 def case_figure(line_integrals: Tensor, geometry: ConeBeamGeometry, *, title: str) -> Figure:
-    """Some of the views, from first to last.
+    """A figure of up to six views, evenly spaced from the first to the last.
 
     Args:
-        line_integrals: (V, rows, cols).
-        geometry: Of the views.
-        title: Above them.
+        line_integrals: Line integrals (V, rows, cols).
+        geometry: Geometry of the views.
+        title: Title of the figure.
     """
     number = len(line_integrals)
     shown = sorted({round(i * (number - 1) / max(min(number, _MOST) - 1, 1)) for i in range(min(number, _MOST))})

@@ -1,4 +1,4 @@
-"""How an implant moved under load, as a figure: deflection along it, and its fragments' motion over the load."""
+"""Figure of an implant's motion under load: deflection along it, and the fragments' relative motion over the load."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ _COLOURS = dict(zip(AXES, COLOURS[:3], strict=True))
 
 
 def comparison_figure(motions: Sequence[RelativeMotion], names: Sequence[str], loads: Sequence[float] = ()) -> Figure:
-    """A figure of deflections against the lower fragment, with bands of one standard deviation; with loads also curves.
+    """A figure of deflections relative to the lower fragment, with bands of one standard deviation.
+
+    With loads it also shows the fragments' relative rotation and translation over the load.
 
     Args:
-        motions: Of the upper fragment, one a loaded run.
-        names: Of the runs.
-        loads: N, one a run; a figure without curves if empty.
+        motions: Relative motion of each loaded run.
+        names: Names of the runs.
+        loads: Load of each run, N; without it no curves over the load are drawn.
     """
     figure = new_figure(9.5, 6.4 if loads else 4.6)
     parts: Any = figure.subfigures(2, 1, height_ratios=[3, 2]) if loads else [figure]
@@ -38,9 +40,9 @@ def comparison_figure(motions: Sequence[RelativeMotion], names: Sequence[str], l
             panel.plot(height, value, color=shade, label=name)
         panel.axhline(0, color="0.6", linewidth=0.8, zorder=0)
         panel.set_ylabel(f"{axis}\n(mm)")
-    panels[0].set_title("deflection along the implant against the lower fragment", fontsize=11)
+    panels[0].set_title("deflection along the implant, relative to the lower fragment", fontsize=11)
     panels[0].legend(frameon=False, fontsize=9, ncols=2)
-    panels[-1].set_xlabel("along the implant (mm)")
+    panels[-1].set_xlabel("position along the implant (mm)")
     if loads:
         _curves(parts[1], motions, loads)
     for axes in figure.axes:

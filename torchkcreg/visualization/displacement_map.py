@@ -1,4 +1,4 @@
-"""Displacement maps: the deformed implant coloured by how far each node moved (fig. 3B of the paper)."""
+"""Figures of displacement maps: the deformed implant coloured by displacement (fig. 3B of the paper)."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _MOST_NODES = 40000
 _HEIGHT_IN = 6.5
 _TURN_DEG, _TILT_DEG = 40.0, 25.0
 _EXAGGERATIONS = (20.0, 10.0, 5.0, 2.0, 1.0)
-_DRAWN_SHARE = 0.1  # of the implant's length: as far as the largest displacement is drawn
-_HEIGHT_IN, _WIDTH_IN = 5.5, 1.25
+_DRAWN_SHARE = 0.1  # largest drawn displacement, as a share of the implant's length
+_PANEL_HEIGHT_IN, _PANEL_WIDTH_IN = 5.5, 1.25
 
 
 @dataclass(frozen=True)
 class _Upright:
-    """Nodes in the implant's axes (width, thickness, length), before and after, how far they moved, and their size."""
+    """Nodes in the implant's axes (width, thickness, length) before and after, their displacements, and dot size."""
 
     before: NDArray
     after: NDArray
@@ -50,21 +50,22 @@ def displacement_figure(
     title: str | None = None,
     label: str = "displacement (mm)",
 ) -> Figure:
-    """A figure of an implant from its flat side, its edge and obliquely, nodes coloured by their displacement.
+    """A figure of an implant from its flat side, its edge and obliquely, with nodes coloured by their displacement.
 
-    The undeformed implant lies behind in grey. The views follow the implant's principal axes, its long axis upright
-    with the end that is up in the world on top, all to one scale.
+    The undeformed implant is drawn in grey behind it. The views follow the implant's principal axes, with the long axis
+    upright and the end that is up in the world on top. All views have the same scale.
 
     Args:
-        undeformed: nodes (N, 3) in the world, mm, such as `torchkcreg.evaluation.DisplacementMap.undeformed`.
-        vectors: their displacements (N, 3), mm.
-        exaggeration: displacements are drawn this many times too large (the colours and numbers are not).
-        limit_mm: end of the colour scale; the largest displacement if not given.
-        title: above the figure.
-        label: of the colour bar.
+        undeformed: Undeformed nodes (N, 3) in the world, mm, such as
+            `torchkcreg.evaluation.DisplacementMap.undeformed`.
+        vectors: Displacements (N, 3) of the nodes, mm.
+        exaggeration: Factor by which displacements are drawn too large. Colours and numbers are not exaggerated.
+        limit_mm: Upper end of the colour scale; the largest displacement if None.
+        title: Title of the figure.
+        label: Label of the colour bar.
 
     Raises:
-        ValueError: shapes don't fit, or there are fewer than three nodes.
+        ValueError: The shapes do not match, or there are fewer than three nodes.
     """
     if undeformed.ndim != 2 or undeformed.shape[-1] != 3 or undeformed.shape != vectors.shape or len(undeformed) < 3:
         shapes = f"{tuple(undeformed.shape)} and {tuple(vectors.shape)}"
@@ -86,7 +87,7 @@ def displacement_figure(
         axis.set_title(name, fontsize=10)
         axis.set_xlim(limit)
     axes[0].set_ylabel("along the implant (mm)")
-    axes[2].set_axis_off()  # lengths are foreshortened there
+    axes[2].set_axis_off()  # oblique lengths are foreshortened
     figure.colorbar(dots, ax=axes, label=label, shrink=0.8, pad=0.04, aspect=35)
     drawn = "" if exaggeration == 1 else f", drawn {exaggeration:g} times too large"
     figure.suptitle((f"{title}\n" if title else "") + f"largest {largest:.2f} mm{drawn}", fontsize=11)
@@ -111,7 +112,7 @@ def _upright(undeformed: Tensor, vectors: Tensor, exaggeration: float) -> _Uprig
 
 
 def _projection(turn_deg: float, tilt_deg: float) -> NDArray:
-    """Columns right, up and towards the viewer, for nodes turned about their long axis and then tilted forward."""
+    """View frame (3, 3) with columns right, up and towards the viewer, turned about the long axis, then tilted."""
     turn, tilt = np.deg2rad([turn_deg, tilt_deg])
     right = np.array([np.cos(turn), np.sin(turn), 0.0])
     towards = np.array([np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt), np.sin(tilt)])
@@ -119,7 +120,7 @@ def _projection(turn_deg: float, tilt_deg: float) -> NDArray:
 
 
 def _limits(nodes: _Upright, frame: NDArray) -> tuple[float, float]:
-    """The abscissae from left to right that a view shows: the implant and a margin, and room for the ticks at least."""
+    """Horizontal limits of a view: the implant with a margin, but wide enough for the ticks."""
     right = np.concatenate([nodes.before, nodes.after]) @ frame[:, 0]
     half = max(0.55 * float(np.ptp(right)) + 1.0, 0.45 / nodes.inch_per_mm)
     middle = float(right.max() + right.min()) / 2
@@ -145,11 +146,11 @@ def _draw(axes: Axes, nodes: _Upright, frame: NDArray, norm: Normalize) -> PathC
 
 
 def series_figure(panels: Mapping[str, tuple[Tensor, Tensor]], *, label: str) -> Figure:
-    """A figure of an implant from its edge, a panel a configuration, the undeformed one in grey.
+    """A figure of an implant from its edge, one panel for each configuration, with the undeformed implant in grey.
 
     Args:
-        panels: Undeformed nodes (N, 3) in the world and their displacements (N, 3), mm, by the panels' titles.
-        label: Of the colour bar.
+        panels: Undeformed nodes (N, 3) in the world and their displacements (N, 3), mm, by panel title.
+        label: Label of the colour bar.
 
     Raises:
         ValueError: If there is no panel.
@@ -159,20 +160,28 @@ def series_figure(panels: Mapping[str, tuple[Tensor, Tensor]], *, label: str) ->
     lengths = {name: vectors.norm(dim=1).numpy() for name, (_, vectors) in panels.items()}
     largest = max(float(length.max()) for length in lengths.values())
     norm = Normalize(0.0, max(largest, 1e-9))
-    figure = new_figure(_WIDTH_IN * len(panels) + 1.4, _HEIGHT_IN)
+    figure = new_figure(_PANEL_WIDTH_IN * len(panels) + 1.4, _PANEL_HEIGHT_IN)
     columns = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (name, (nodes, vectors)) in zip(columns, panels.items(), strict=True):
         _, directions = principal_axes(nodes)
         thin, long = directions[0].numpy(), directions[-1].numpy()
         thin, long = thin * np.sign(thin[np.abs(thin).argmax()]), long * np.sign(long[2] or 1.0)
         size = float(np.ptp(nodes.numpy() @ long))
-        times = next((x for x in _EXAGGERATIONS if x * largest <= _DRAWN_SHARE * size), 1.0)
-        at, by = (nodes - nodes.mean(0)).numpy(), times * vectors.numpy()
-        axes.scatter(at @ thin, at @ long, s=1, c="0.8", linewidths=0)
-        axes.scatter((at + by) @ thin, (at + by) @ long, s=1, c=lengths[name], cmap=COLOUR_MAP, norm=norm, linewidths=0)
+        exaggeration = next((x for x in _EXAGGERATIONS if x * largest <= _DRAWN_SHARE * size), 1.0)
+        positions, steps = (nodes - nodes.mean(0)).numpy(), exaggeration * vectors.numpy()
+        axes.scatter(positions @ thin, positions @ long, s=1, c="0.8", linewidths=0)
+        axes.scatter(
+            (positions + steps) @ thin,
+            (positions + steps) @ long,
+            s=1,
+            c=lengths[name],
+            cmap=COLOUR_MAP,
+            norm=norm,
+            linewidths=0,
+        )
         axes.set_aspect("equal")
         axes.set_axis_off()
         axes.set_title(f"{name}\n{lengths[name].max():.2f} mm", fontsize=9)
     figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=list(columns), label=label, shrink=0.7)
-    figure.suptitle(f"displacements drawn {times:g} times as large", fontsize=9)
+    figure.suptitle(f"displacements drawn {exaggeration:g} times as large", fontsize=9)
     return figure

@@ -1,4 +1,4 @@
-"""Errors of a registration: over the implant, and as a histogram (fig. 4B of the paper)."""
+"""Figures of a registration's errors: error map of the implant, and histograms (fig. 4B of the paper)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .displacement_map import _HEIGHT_IN, _draw, _limits, _projection, _upright
 from .style import AMBER, BLUE, GREEN, new_figure, open_frame
 
 _VIEWS = (("front", 0.0, 0.0), ("back", 180.0, 0.0), ("edge", 90.0, 0.0), ("oblique", 40.0, 25.0))
-_DOT = 2.0  # random samples leave gaps that a lattice does not
+_DOT = 2.0  # larger dots, because random samples leave gaps
 _COLOURS = ("0.55", BLUE, AMBER, GREEN)
 
 
@@ -27,17 +27,17 @@ def error_map_figure(
     title: str | None = None,
     label: str = "error (mm)",
 ) -> Figure:
-    """A figure of an implant from both flat sides, its edge and obliquely, points coloured by their error.
+    """A figure of an implant from both flat sides, its edge and obliquely, with points coloured by their error.
 
     Args:
-        points: where the errors are (N, 3) in the world, mm.
-        errors: distances (N,), mm.
-        limit_mm: end of the colour scale, larger errors have its last colour; by default what 99.5 % stay below.
-        title: above the figure.
-        label: of the colour bar.
+        points: Points (N, 3) of the errors in the world, mm.
+        errors: Distances (N,), mm.
+        limit_mm: Upper end of the colour scale; larger errors have its last colour. By default the 99.5 % quantile.
+        title: Title of the figure.
+        label: Label of the colour bar.
 
     Raises:
-        ValueError: shapes don't fit, or there are fewer than three points.
+        ValueError: The shapes do not match, or there are fewer than three points.
     """
     if points.ndim != 2 or points.shape[-1] != 3 or points.shape[:1] != errors.shape or len(points) < 3:
         shapes = f"{tuple(points.shape)} and {tuple(errors.shape)}"
@@ -46,7 +46,7 @@ def error_map_figure(
     largest = float(values.max())
     limit = limit_mm if limit_mm is not None else max(float(np.quantile(values.numpy(), 0.995)), 1e-6)
     along = torch.zeros_like(points)
-    along[:, 0] = values.to(points)  # as displacements that are not drawn: colours and thinning are the same
+    along[:, 0] = values.to(points)  # errors as displacements that are not drawn: same colours and thinning
     nodes = _upright(points, along, 0.0)
     nodes = replace(nodes, after=nodes.before, dot_area=_DOT * nodes.dot_area)
     frames = [_projection(turn, tilt) for _, turn, tilt in _VIEWS]
@@ -59,7 +59,7 @@ def error_map_figure(
         axis.set_title(name, fontsize=10)
         axis.set_xlim(view)
     axes[0].set_ylabel("along the implant (mm)")
-    axes[-1].set_axis_off()  # lengths are foreshortened there
+    axes[-1].set_axis_off()  # oblique lengths are foreshortened
     extend = "max" if largest > limit else "neither"
     figure.colorbar(dots, ax=axes, label=label, shrink=0.8, pad=0.04, aspect=35, extend=extend)
     rmse = float(values.square().mean().sqrt())
@@ -77,18 +77,18 @@ def histogram_figure(
     xlabel: str = "error (mm)",
     title: str | None = None,
 ) -> Figure:
-    """A figure of one or a few histograms on one axis, as shares of all per bin, with their means.
+    """A figure of one to four histograms on one axis, as share of points per bin, with their means.
 
     Args:
-        distances: name to distances (N,), mm; up to four.
-        fwhm_mm: full widths at half maximum, by the same names, for the legend.
-        floor_mm: the mean that perfect clouds would have, drawn as a line.
-        num_bins: bins between zero and what 99.5 % of all distances stay below; the last one holds the rest.
-        xlabel: label of the abscissa.
-        title: above the figure.
+        distances: Distances (N,) in mm by name; up to four sets.
+        fwhm_mm: Full widths at half maximum by the same names, for the legend.
+        floor_mm: Mean distance between perfect clouds, drawn as a line.
+        num_bins: Number of bins up to the 99.5 % quantile; the last bin also holds all larger distances.
+        xlabel: Label of the horizontal axis.
+        title: Title of the figure.
 
     Raises:
-        ValueError: there is nothing to draw, or more than four.
+        ValueError: There is no set, an empty one, or more than four.
     """
     if not 0 < len(distances) <= len(_COLOURS) or any(len(values) == 0 for values in distances.values()):
         raise ValueError(f"distances must be one to {len(_COLOURS)} sets, none of them empty, got {len(distances)}")

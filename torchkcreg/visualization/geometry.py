@@ -1,4 +1,4 @@
-"""Where focal spots, detectors and the implant are: a scan's views in three dimensions."""
+"""Figure of a scan's geometry in 3D: focal spots, detectors and the implant."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def geometry_figure(
     title: str = "",
     view_from: tuple[float, float] = (24.0, -52.0),
 ) -> Figure:
-    """A figure of focal spots and detectors in the world, with the way that columns and rows run.
+    """A figure of focal spots and detectors in the world, with the directions of columns and rows.
 
     Args:
-        geometry: the views. Spots have a colour for each of its `sources`.
-        points: an implant (N, 3) in the world, mm.
-        labels: of the views; their angle if None, and nothing for more than sixteen views.
-        title: of the figure.
-        view_from: elevation and azimuth of the eye, degrees.
+        geometry: Geometry of the views. Focal spots are coloured by its `sources`.
+        points: Points (N, 3) of an implant in the world, mm.
+        labels: Labels of the views; their angles if None. More than sixteen views are not labelled.
+        title: Title of the figure.
+        view_from: Elevation and azimuth of the viewpoint, degrees.
     """
     frames = DetectorFrames.of(geometry)
     sources, centers = frames.sources.cpu().numpy(), frames.centers.cpu().numpy()
@@ -52,8 +52,12 @@ def geometry_figure(
             for corner in corners:
                 axes.plot(*np.stack([sources[view], corner]).T, color=GREY, linewidth=0.3, alpha=0.35)
     for number, name in enumerate(names):
-        own = [v for v in range(geometry.num_views) if not name or (geometry.sources and geometry.sources[v] == name)]
-        axes.scatter(*sources[own].T, s=22, color=COLOURS[number % len(COLOURS)], label=f"focal spot {name}".strip())
+        spot_views = [
+            v for v in range(geometry.num_views) if not name or (geometry.sources and geometry.sources[v] == name)
+        ]
+        axes.scatter(
+            *sources[spot_views].T, s=22, color=COLOURS[number % len(COLOURS)], label=f"focal spot {name}".strip()
+        )
     first = centers[0] - half[0][0] - half[1][0]  # the corner of pixel (0, 0) of view 0
     for direction, colour, word in ((half[0][0], AMBER, "columns, u"), (half[1][0], GREEN, "rows, v")):
         axes.quiver(*first, *(2 * direction), color=colour, linewidth=2.2, arrow_length_ratio=0.08)

@@ -1,4 +1,4 @@
-"""How a registration went: loss, gradient correlation and step sizes over its iterations."""
+"""Figure of a registration's history: loss, gradient correlation and step sizes over its iterations."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _COLOURS = (BLUE, GREEN, RED)
 
 
 def history_figure(history: Sequence[dict[str, Any]], *, stage_labels: Sequence[str] | None = None) -> Figure:
-    """A figure of what a registration's history records, over its iterations, with the stages marked.
+    """A figure of a registration's history over its iterations, with the stages marked.
 
     Args:
-        history: records in order, each with `loss` and, where known, `gc` (the views' mean), `step_mm`, `stage` (a
-            number that rises), and `evaluations` (candidates tried so far). With `evaluations` in every record they are
-            the abscissa, otherwise the records are counted.
-        stage_labels: a short text a stage ("5 groups").
+        history: Records in order, each with `loss` and, if known, `gc` (mean of the views), `step_mm`, `stage` (an
+            increasing number), and `evaluations` (candidates tried so far). The horizontal axis shows `evaluations` if
+            every record has them, otherwise the number of the record.
+        stage_labels: A short label for each stage ("5 groups").
 
     Raises:
-        ValueError: the history is empty, or holds no `loss`.
+        ValueError: The history is empty, or no record has a `loss`.
     """
     if not history or not any(record.get("loss") is not None for record in history):
         raise ValueError("history must hold at least one record with a loss")
@@ -51,7 +51,7 @@ def history_figure(history: Sequence[dict[str, Any]], *, stage_labels: Sequence[
 
 
 def _curve(axis: Axes, x: NDArray, y: NDArray, stages: list[Any], colour: str, logarithmic: bool) -> None:
-    """A line a stage: a change of stage changes what is measured, so lines don't cross it."""
+    """Draw one line for each stage: the loss may be defined differently in each, so lines are not connected."""
     for stage in dict.fromkeys(stages):
         inside = np.array([s == stage for s in stages])
         axis.plot(x[inside], y[inside], color=colour, linewidth=1.4, marker="o", markersize=2.8)
@@ -62,7 +62,7 @@ def _curve(axis: Axes, x: NDArray, y: NDArray, stages: list[Any], colour: str, l
 
 
 def _spans(x: NDArray, stages: list[Any]) -> list[tuple[Any, float, float]]:
-    """Each stage with the abscissae where it begins and ends."""
+    """Each stage with the horizontal positions of its start and end."""
     firsts = [i for i in range(len(x)) if i == 0 or stages[i] != stages[i - 1]]
     edges = [x[0] - 0.5, *((x[i - 1] + x[i]) / 2 for i in firsts[1:]), x[-1] + 0.5]
     return [(stages[i], float(left), float(right)) for i, (left, right) in zip(firsts, pairwise(edges))]

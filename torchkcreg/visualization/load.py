@@ -1,4 +1,4 @@
-"""What an implant carries, as a figure: moments along it, and the stress on its surface."""
+"""Figure of the load on an implant: moments along it, and the stress on its surface."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torchkcreg.mechanics import CarriedLoad
 from .style import AMBER, BLUE, GREEN, new_figure, open_frame
 
 _MOMENTS = {
-    3: ("bending out of its plane", BLUE),
-    4: ("bending in its plane", AMBER),
+    3: ("out-of-plane bending", BLUE),
+    4: ("in-plane bending", AMBER),
     5: ("torsion", GREEN),
 }
 
@@ -23,11 +23,11 @@ def load_figure(
     """A figure of moments along an implant, with a band of one standard deviation, and von Mises stress on both sides.
 
     Args:
-        carried: What it carries.
-        points: Of its surface, in its frame, (P, 3), mm.
-        stress: There, (P,), N/mm^2.
-        yield_stress: Where the alloy begins to stay bent, N/mm^2.
-        title: Above the figure.
+        carried: Load carried by the implant.
+        points: Points (P, 3) of the implant's surface in its frame, mm.
+        stress: Von Mises stress (P,) at the points, N/mm^2.
+        yield_stress: Yield stress of the alloy, N/mm^2.
+        title: Title of the figure.
     """
     figure = new_figure(9.5, 5.6)
     top, *rows = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": [3, 1, 1]})
@@ -57,7 +57,7 @@ def load_figure(
         axes.set_aspect("equal")
         axes.set_ylabel(f"{name}\n(mm)")
         open_frame(axes)
-    rows[-1].set_xlabel("along the implant (mm); grey lines: where it may be held")
-    told = "" if yield_stress is None else f"; yield {yield_stress:.0f}"
-    figure.colorbar(dots, ax=rows, label=f"von Mises\n(MPa{told})", shrink=0.9, pad=0.01, aspect=10, extend="max")
+    rows[-1].set_xlabel("position along the implant (mm); grey lines: possible fixation points")
+    yield_text = "" if yield_stress is None else f"; yield {yield_stress:.0f}"
+    figure.colorbar(dots, ax=rows, label=f"von Mises\n(MPa{yield_text})", shrink=0.9, pad=0.01, aspect=10, extend="max")
     return figure

@@ -1,4 +1,4 @@
-"""Measured projections with the registered implant laid over them (fig. 3A of the paper)."""
+"""Overlays of the registered implant on the measured projections (fig. 3A of the paper)."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ def overlay_figure(
     crop: bool = True,
     label: str = "after",
 ) -> Figure:
-    """A figure of projections in grey with the implant's DRR in green, a column a view, before (if given) over after.
+    """A figure of projections in grey with the implant's DRR in green, one column for each view.
 
-    Dense is bright, as on a radiograph. Where the DRR covers the implant's shadow, the shadow is green; where it does
-    not, it stays white, and green lies on the background: so a misfit shows on both sides. A thin line follows the
-    DRR's outline.
+    The row of the start (if `before` is given) is above that of the result. Dense is bright, as on a radiograph. Where
+    the DRR covers the implant's shadow, the shadow is green; elsewhere it is white, and green lies on the background.
+    A misfit is thus visible on both sides. A thin line follows the DRR's outline.
 
     Args:
-        measured: line integrals (V, rows, cols).
+        measured: Line integrals (V, rows, cols).
         after: DRRs of the registered implant, same shape, any unit.
         before: DRRs at the start, same shape.
-        view_labels: title of each column ("91 deg, T1").
-        gc_before: gradient correlation of each view at the start (V,), written into the panels.
-        gc_after: the same at the end.
-        pixel_spacing: (dv, du) in mm, for a scale bar at the detector and square millimetres.
-        margin_px: pixels kept around the implant.
-        crop: show only the implant's surroundings, the same size in each view.
-        label: of the row of `after`.
+        view_labels: Title of each column ("91 deg, T1").
+        gc_before: Gradient correlations (V,) at the start, written into the panels.
+        gc_after: Gradient correlations (V,) at the end.
+        pixel_spacing: (dv, du) in mm, for the aspect ratio and a scale bar at the detector.
+        margin_px: Margin around the implant, pixels.
+        crop: Show only the implant's surroundings, the same size in each view.
+        label: Label of the row of `after`.
 
     Raises:
-        ValueError: shapes differ.
+        ValueError: The shapes differ.
     """
     given = {"measured": measured, "before": before, label: after}
     for name, tensor in given.items():
@@ -87,14 +87,14 @@ def overlay_figure(
 
 
 def overlay_layers(measured: Tensor, drr: Tensor, *, margin_px: int = 20) -> tuple[NDArray, NDArray]:
-    """What a page shows one over the other: measured views (V, h, w) in grey, and with the DRR in green (V, h, w, 3).
+    """Image layers for an HTML page: measured views (V, h, w) in grey, and with the DRR in green (V, h, w, 3).
 
     Both are uint8 and show the implant's surroundings, the same size in each view.
 
     Args:
-        measured: line integrals (V, rows, cols).
+        measured: Line integrals (V, rows, cols).
         drr: DRRs of the registered implant, same shape, any unit.
-        margin_px: pixels kept around the implant.
+        margin_px: Margin around the implant, pixels.
     """
     images, shadows = (tensor.detach().cpu().double().numpy() for tensor in (measured, drr))
     cut = [
@@ -107,7 +107,7 @@ def overlay_layers(measured: Tensor, drr: Tensor, *, margin_px: int = 20) -> tup
 
 
 def _windows(drrs: list[NDArray], margin_px: int) -> list[tuple[slice, slice]]:
-    """Rows and columns around the implant in each view, of one size."""
+    """Rows and columns around the implant, of the same size in each view."""
     shadow = np.max([drr > 0.02 * max(drr.max(), 1e-12) for drr in drrs], axis=0)
     _, num_rows, num_cols = shadow.shape
     boxes = []
@@ -116,7 +116,7 @@ def _windows(drrs: list[NDArray], margin_px: int) -> list[tuple[slice, slice]]:
         boxes.append((v[0], v[-1] + 1, u[0], u[-1] + 1) if v else (0, num_rows, 0, num_cols))
     height = min(num_rows, max(box[1] - box[0] for box in boxes) + 2 * margin_px)
     width = max(box[3] - box[2] for box in boxes) + 2 * margin_px
-    width = min(num_cols, max(width, height // 4))  # room for the text beside a slim plate seen edge on
+    width = min(num_cols, max(width, height // 4))  # room for text if a slim plate is seen edge on
     windows = []
     for top, bottom, left, right in boxes:
         first_row = int(np.clip((top + bottom - height) // 2, 0, num_rows - height))
@@ -142,7 +142,7 @@ def _grey(image: NDArray) -> NDArray:
 
 
 def _thickness(drr: NDArray) -> NDArray:
-    """How much metal there is, from 0 to 1."""
+    """Relative thickness of metal, from 0 to 1."""
     most = float(np.percentile(drr[drr > 0], 90)) if (drr > 0).any() else 1.0
     return np.clip(drr / max(most, 1e-12), 0, 1)
 

@@ -1,4 +1,4 @@
-"""A report as one HTML page that needs nothing else: pictures, table, and a view of the implant in three dimensions."""
+"""A report as one self-contained HTML page: table, pictures, and a 3D view of the implant."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ VERDICTS = ("ok", "doubtful", "failed")
 
 @dataclass(frozen=True)
 class Row:
-    """A number of the table.
+    """A row of the table.
 
     Attributes:
-        name: what it is.
-        value: with its unit.
-        deviation: expected error, with its unit; empty where there is none.
-        about: a sentence that says what it means; empty where the name does.
+        name: Name of the quantity.
+        value: Value with unit.
+        deviation: Expected error with unit; empty if unknown.
+        about: A sentence of explanation; empty if the name is clear.
     """
 
     name: str
@@ -36,19 +36,20 @@ class Row:
 
 @dataclass(frozen=True)
 class Page:
-    """What a report shows, in this order.
+    """Contents of a report, in the order shown.
 
     Attributes:
-        title: of the page.
-        verdict: "ok", "doubtful" or "failed"; None for what has no verdict.
-        summary: a sentence beside it.
-        warnings: what a user should know before trusting the numbers.
-        rows: the table.
-        scene: of the 3D view, see `implant_scene`; None for none.
-        layers: label, PNG of a measured view, and PNG of it with the implant: blinked, as a checkerboard, wiped.
-        pictures: title and PNG of each.
-        details: title and text of each, folded away.
-        made_with: a line about versions.
+        title: Title of the page.
+        verdict: "ok", "doubtful" or "failed"; None without a verdict.
+        summary: A sentence beside the verdict.
+        warnings: Warnings to read before trusting the numbers.
+        rows: Rows of the table.
+        scene: Data of the 3D view, see `implant_scene`; None for no 3D view.
+        layers: For each view a label, a PNG of the measured view, and a PNG of it with the implant. The page compares
+            both as overlay, by blinking, as a checkerboard, or with a wipe.
+        pictures: Title and PNG of each picture.
+        details: Title and text of each collapsed section.
+        made_with: Line with software versions.
     """
 
     title: str
@@ -64,10 +65,10 @@ class Page:
 
 
 def page_html(page: Page) -> str:
-    """The page as HTML: no other file, no network.
+    """The page as HTML that needs no other file and no network.
 
     Raises:
-        ValueError: a verdict that there is not.
+        ValueError: The verdict is unknown.
 
     >>> "<h1>run &lt;1&gt;</h1>" in page_html(Page("run <1>", verdict="ok"))
     True
@@ -111,7 +112,7 @@ def _verdict(page: Page) -> str:
 def _table(rows: Sequence[Row]) -> str:
     if not rows:
         return ""
-    errors = any(row.deviation for row in rows)  # a column that nothing stands in is none
+    errors = any(row.deviation for row in rows)  # no column without entries
     lines = [
         f"<tr><td>{escape(row.name)}{f'<small>{escape(row.about)}</small>' if row.about else ''}</td>"
         f'<td class="number">{escape(row.value)}</td>'
@@ -136,10 +137,11 @@ def _layers(layers: Sequence[tuple[str, bytes, bytes]]) -> str:
         f'<section class="layers"><h2>The implant over the measured views</h2>{images}'
         f'<div class="controls"><label>view <select name="view">{options}</select></label>'
         f'<label>show <select name="mode">{modes}</select></label>'
-        '<label>place, size <input type="range" name="place" min="0" max="100" value="50"></label></div>'
+        '<label>wipe position, checkerboard size <input type="range" name="place" min="0" max="100" value="50"></label>'
+        "</div>"
         '<canvas role="img" aria-label="A measured view with the registered implant in green"></canvas>'
-        "<p>Green where the implant is in the model. Where its shadow stays white, or green lies beside it, the two "
-        "do not agree.</p></section>"
+        "<p>The implant of the model is green. Where the shadow stays white, or green lies beside the shadow, model "
+        "and image do not agree.</p></section>"
     )
 
 
@@ -160,14 +162,14 @@ def _viewer(scene: dict[str, Any] | None) -> str:
     content = json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c")
     views = '<label><input type="checkbox" name="views"> focal spots and detectors</label>' if scene["sources"] else ""
     return (
-        '<section class="viewer"><h2>The implant in its place</h2>'
+        '<section class="viewer"><h2>The implant in 3D</h2>'
         f'<script type="application/json">{content}</script>'
         '<canvas role="img" aria-label="The registered implant, coloured by its displacement; drag to turn"></canvas>'
         '<div class="controls"><label>displacement <input type="range" name="times" min="0" max="20" value="1">'
         "<output>1 x</output></label>"
         '<label>colour <select name="value"><option value="displacement">displacement</option>'
         f'<option value="std">expected error</option></select></label>{views}</div>'
-        "<p>Drag to turn, wheel or two fingers to zoom. 0 x is the undeformed implant, 1 x what was measured.</p>"
+        "<p>Drag to turn, wheel or two fingers to zoom. 0 x: undeformed implant, 1 x: measured displacement.</p>"
         "</section>"
     )
 

@@ -1,4 +1,4 @@
-"""Which views to take, as a figure: expected errors over the number of views, and where the best sets look from."""
+"""Figure of planned views: expected error over the number of views, and gantry angles of the best sets."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ def plan_figure(
     labels: Sequence[Sequence[str]],
     angles_deg: Sequence[float] | None = None,
 ) -> Figure:
-    """A figure of the best sets against random ones and, where gantry angles are known, of the directions of some.
+    """A figure of the expected errors of the best and of random sets of views.
+
+    If gantry angles are given, the directions of some sets are drawn too.
 
     Args:
-        best: Sets by their number of views, best first.
-        random: Expected errors (S,) of random sets of as many views, mm.
-        shown: Sets of one number of views whose directions are drawn.
-        labels: Their views in words.
-        angles_deg: Of all views.
+        best: Planned sets by number of views, best first.
+        random: Expected errors (S,) of random sets by number of views, mm.
+        shown: Sets whose directions are drawn, all with the same number of views.
+        labels: Labels of the views of each set in `shown`.
+        angles_deg: Gantry angles of all candidate views, degrees.
     """
     figure = new_figure(9.5, 4.2)
     left = figure.add_subplot(1, 2, 1)
@@ -37,7 +39,10 @@ def plan_figure(
         below, above = ([float(random[n].double().quantile(q)) for n in numbers] for q in (low, high))
         left.fill_between(numbers, below, above, color="0.6", alpha=shade, linewidth=0)
     left.plot(
-        numbers, [float(random[n].median()) for n in numbers], color="0.4", label="random views: median, 50, 90 %"
+        numbers,
+        [float(random[n].median()) for n in numbers],
+        color="0.4",
+        label="random views: median, 50 % and 90 % bands",
     )
     left.plot(numbers, [best[n][0].node_std_mm for n in numbers], "o-", color=COLOURS[0], label="best views")
     left.set(xlabel="number of views", ylabel="expected error of the nodes (mm)", xticks=numbers, yscale="log")
@@ -48,16 +53,16 @@ def plan_figure(
     open_frame(left)
     if angles_deg is not None:
         right = figure.add_subplot(1, 2, 2, projection="polar")
-        for rank, (one, words, colour) in enumerate(zip(shown, labels, COLOURS, strict=False)):
-            angles = np.radians([angles_deg[view] for view in one.views])
+        for rank, (planned_set, words, colour) in enumerate(zip(shown, labels, COLOURS, strict=False)):
+            angles = np.radians([angles_deg[view] for view in planned_set.views])
             radius = 1 - 0.12 * rank
-            right.scatter(angles, np.full(len(angles), radius), color=colour, label=f"{one.node_std_mm:.3f} mm")
+            right.scatter(angles, np.full(len(angles), radius), color=colour, label=f"{planned_set.node_std_mm:.3f} mm")
             if rank == 0:
                 for angle, word in zip(angles, words, strict=True):
                     right.annotate(word, (angle, radius), (0, 8), textcoords="offset points", ha="center", fontsize=8)
         right.set(ylim=(0, 1.2), yticks=[])
         right.set_title(f"gantry angles of the best sets of {len(shown[0].views)}", fontsize=11)
-        right.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.08, 1.0), title="expected")
+        right.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.08, 1.0), title="expected error")
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Reconstructed slices side by side, their difference and profiles (fig. 5 of the paper)."""
+"""Figures of reconstructions: slices, differences and profiles (fig. 5 of the paper), and an estimated spectrum."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchkcreg.physics import Beam
 from .style import COLOURS, new_figure, open_frame
 
 _COLOURS = ("0.25", *COLOURS[:4])
-_LEAST_SHARE = 0.98  # of a pixel's metal: what is drawn for one metal has next to nothing of the others
+_LEAST_SHARE = 0.98  # smallest share of a metal in a pixel's path through metal, to be drawn for that metal
 
 
 def reconstruction_figure(
@@ -30,20 +30,22 @@ def reconstruction_figure(
     metal: Tensor | None = None,
     unit: str = "1/mm",
 ) -> Figure:
-    """A figure of axial slices, a column a volume and a row a height, with a difference and a profile if asked for.
+    """A figure of axial slices, one column for each volume and one row for each height.
+
+    A difference of two volumes and a profile are optional.
 
     Args:
-        volumes: title and volume (D, H, W) of each column, all on one grid without rotation.
-        grid: the voxels.
-        heights_mm: z of the slices; the nearest ones are drawn.
-        window: grey values that are black and white; from the first volume's values if None.
-        difference: names of two volumes; a column shows the first minus the second.
-        profile_y_mm: draws the values along x at this y, below the slices.
-        metal: (D, H, W), outlined in yellow where it is above a half.
-        unit: of the values, for the axis.
+        volumes: Volumes (D, H, W) by title, all on the same grid without rotation.
+        grid: Voxel grid of the volumes.
+        heights_mm: Heights z of the slices; the nearest slices are drawn.
+        window: Values drawn black and white; from the first volume's 1 % and 99.5 % quantiles if None.
+        difference: Titles of two volumes; an extra column shows the first minus the second.
+        profile_y_mm: If given, a profile along x at this y and the last height is drawn below the slices.
+        metal: Share of metal (D, H, W), outlined in yellow at 0.5.
+        unit: Unit of the values, for the profile's axis.
 
     Raises:
-        ValueError: no volume, another shape than the grid's, or a difference of unknown volumes.
+        ValueError: There is no volume, a volume does not have the grid's shape, or `difference` names an unknown one.
     """
     if not volumes:
         raise ValueError("volumes must hold at least one volume")
@@ -116,34 +118,36 @@ def _index(position: float, origin: float, spacing: float, count: int) -> int:
 
 
 def beam_figure(beam: Beam, names: Sequence[str], lengths_mm: Tensor, measured: Tensor) -> Figure:
-    """Transmission over thickness of each metal, with the pixels it was estimated from, ten quantiles at a time.
+    """A figure of transmission over thickness for each metal, with the pixels that it was estimated from.
+
+    The pixels are shown in up to ten groups of thickness: medians, with 16 % and 84 % quantiles as error bars.
 
     Args:
-        beam: As estimated, with the attenuation of the metals.
-        names: Of the metals.
-        lengths_mm: Path lengths (M, N) of the pixels.
-        measured: Their transmissions (N,) without the background's.
+        beam: The estimated beam, with the attenuation of the metals.
+        names: Names of the metals.
+        lengths_mm: Path lengths (M, N) of the pixels in each metal, mm.
+        measured: Measured transmissions (N,) of the pixels, without the background.
     """
     figure = new_figure(5.2, 3.6)
     axes = figure.subplots()
     total = lengths_mm.sum(0)
     longest = float(total.max())
     for row, (name, colour) in enumerate(zip(names, COLOURS * len(names))):
-        own = lengths_mm[row] > _LEAST_SHARE * total
+        single_metal = lengths_mm[row] > _LEAST_SHARE * total
         line = torch.linspace(0, longest, 100, dtype=torch.float64, device="cpu")
         paths = torch.zeros(1, len(names), 1, 1, len(line), dtype=torch.float64, device="cpu")
         paths[0, row, 0, 0] = line
         axes.plot(line, beam.transmission(paths)[0, 0, 0], color=colour, label=name)
-        if int(own.sum()) < 20:
+        if int(single_metal.sum()) < 20:
             continue
-        lengths, values = lengths_mm[row][own].cpu().numpy(), measured[own].cpu().numpy()
+        lengths, values = lengths_mm[row][single_metal].cpu().numpy(), measured[single_metal].cpu().numpy()
         groups = np.array_split(np.argsort(lengths), min(10, len(lengths) // 10))
         middle = [float(np.median(values[g])) for g in groups]
         low, high = ([float(np.percentile(values[g], q)) for g in groups] for q in (16, 84))
         error = np.abs(np.array([low, high]) - np.array(middle))
-        at = [float(np.median(lengths[g])) for g in groups]
-        axes.errorbar(at, middle, yerr=error, fmt="o", markersize=3, color=colour, linewidth=1)
-    axes.set(yscale="log", xlabel="thickness, mm", ylabel="transmission", ylim=(1e-3, 1.3))
+        median_lengths = [float(np.median(lengths[g])) for g in groups]
+        axes.errorbar(median_lengths, middle, yerr=error, fmt="o", markersize=3, color=colour, linewidth=1)
+    axes.set(yscale="log", xlabel="thickness (mm)", ylabel="transmission", ylim=(1e-3, 1.3))
     open_frame(axes)
     axes.legend(frameon=False)
     return figure

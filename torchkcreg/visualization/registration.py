@@ -1,4 +1,4 @@
-"""Pictures of a registration: start and result over the projections, how the implant bent, how the loss fell."""
+"""Figures of a registration: overlays of start and result on the projections, bending of the implant, and history."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MOST_VIEWS = 6
 _EXAGGERATIONS = (20.0, 10.0, 5.0, 2.0)
-_DRAWN_SHARE = 0.05  # of the implant's length: as far as the largest displacement is drawn
+_DRAWN_SHARE = 0.05  # largest drawn displacement, as a share of the implant's length
 
 
 def draw_registration(
@@ -34,12 +34,12 @@ def draw_registration(
 ) -> dict[str, Figure]:
     """Figures of a registration by file name: "overlay.png", "displacement.png", "history.png".
 
-    The displacements of a second implant, and of more, are in pictures that begin with its name.
+    For further implants, the file name of the displacement figure begins with the implant's name.
 
     Args:
         result: The registration, with its scene.
-        data: What was registered; of more than six views, six are drawn.
-        starts: Pose (4, 4) of each implant at which the registration started.
+        data: The registered data; at most six views are drawn.
+        starts: Start pose (4, 4) of each implant.
 
     Raises:
         ValueError: If the result has no scene.
@@ -58,7 +58,7 @@ def draw_registration(
 
 
 def registered_layers(result: RegistrationResult, data: RegistrationData) -> dict[str, Any]:
-    """Views to lay over each other on a page: "grey", "overlay" (see `overlay_layers`) and "labels"; six at most."""
+    """Image layers of up to six views for an HTML page: "grey" and "overlay" (see `overlay_layers`), and "labels"."""
     if result.scene is None:
         raise ValueError("the result has no scene to draw: it was read from files")
     data = replace(data, geometry=result.corrected(data.geometry))
@@ -80,12 +80,12 @@ def start_scene(scene: Scene, starts: Sequence[Tensor]) -> Scene:
     with torch.no_grad():
         for assembly, pose in zip(start, starts, strict=True):
             assembly.deformation.reset()
-            assembly.implant_to_world.copy_(pose)
+            assembly.implant_to_world = pose
     return start
 
 
 def _as_told(scene: Scene) -> Scene:
-    """The scene for a geometry that is right: a copy, if it has motions of views."""
+    """The scene without corrections of views (`view_motions`), for a geometry that already includes them."""
     if scene.view_motions is None:
         return scene
     bare = copy.deepcopy(scene)
@@ -94,7 +94,7 @@ def _as_told(scene: Scene) -> Scene:
 
 
 def draw_start(scene: Scene, data: RegistrationData) -> Figure:
-    """The figure of a scene as it stands over the views; of more than six, six are drawn."""
+    """Overlay of a scene, as it is, on its views; at most six are drawn."""
     views = _drawn_views(data)
     shown = data.select(views)
     return overlay_figure(
@@ -133,14 +133,14 @@ def _drr(scene: Scene, data: RegistrationData) -> Tensor:
 
 
 def _similarity(scene: Scene, data: RegistrationData, result: RegistrationResult) -> Tensor:
-    """GC (V,) as the result has it, so that start and result are measured alike."""
+    """GC (V,) with the settings of the result's last stage, so that start and result are comparable."""
     run = StageRun(scene, data, result.config.schedule()[-1], result.config)
     run.with_background()
     return similarities(run, GradientCorrelation)
 
 
 def _labels(geometry: ConeBeamGeometry, views: list[int]) -> list[str]:
-    """Titles of the views: angle and source where the geometry knows them."""
+    """Titles of the views: angle and source if the geometry has them, otherwise the number."""
     if geometry.angles_deg is None:
         return [f"view {view}" for view in views]
     names = [f"{angle:g}°" for angle in geometry.angles_deg]
@@ -157,6 +157,6 @@ def _displacement(implant: RegisteredImplant, assembly: Assembly) -> Figure:
         bent.undeformed,
         bent.vectors,
         exaggeration=drawn,
-        title=f"bending of the {assembly.name}, its distal end at rest",
-        label="displacement against the distal end (mm)",
+        title=f"bending of the {assembly.name} relative to its distal end",
+        label="displacement relative to the distal end (mm)",
     )

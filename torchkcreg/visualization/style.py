@@ -1,4 +1,4 @@
-"""One look for all figures: colours that the colour-blind tell apart (Okabe and Ito), white ground, open frames."""
+"""Common style of all figures: colour-blind safe colours (Okabe and Ito), white background, open frames."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ GREY = "0.45"
 COLOURS = (BLUE, AMBER, GREEN, RED, PINK, SKY)
 
 
-def new_figure(width_in: float, height_in: float, **how: Any) -> Figure:
-    """An empty figure of a size in inches; `how` as of matplotlib's `Figure`."""
-    return Figure(**{"figsize": (width_in, height_in), "layout": "constrained", "facecolor": "white", **how})
+def new_figure(width_in: float, height_in: float, **options: Any) -> Figure:
+    """An empty figure of a size in inches; `options` are passed to matplotlib's `Figure`."""
+    return Figure(**{"figsize": (width_in, height_in), "layout": "constrained", "facecolor": "white", **options})
 
 
 def open_frame(axes: Axes) -> None:
-    """Takes the frame's upper and right edge away."""
+    """Remove the upper and right edge of the frame."""
     axes.spines[["top", "right"]].set_visible(False)

@@ -1,5 +1,5 @@
-// CPU kernel of a separable filter along rows and columns, the border repeated, and of its transpose. A task is a few
-// rows of one image; their pixels are its own, so sums don't depend on the number of threads.
+// CPU kernel of a separable filter along rows and columns with replicated border, and of its transpose. Each task
+// writes a few rows of one image, and no other task writes them, so sums don't depend on the number of threads.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
@@ -20,8 +20,8 @@ using torch::stable::Tensor;
 
 constexpr int64_t kRowsOfTask = 16;
 
-// What the filter makes of a line of n pixels beyond its border. Forward, a pixel beyond it is the last one before;
-// transposed, what would go to such a pixel goes to the last one.
+// Border handling for a line of n pixels. Forward, a pixel beyond the border has the value of the last one inside;
+// transposed, contributions to such a pixel are added to the last one inside.
 template <typename scalar_t>
 class Filter {
  public:
@@ -32,7 +32,7 @@ class Filter {
 
   int64_t radius() const { return radius_; }
 
-  // Lines that make output line i of n: their numbers are first, first + 1, ...; returns how many.
+  // Input lines of output line i of n: first, first + 1, ...; returns their number.
   int64_t share(int64_t i, int64_t n, int64_t& first, std::vector<scalar_t>& weights) const {
     first = std::max<int64_t>(i - radius_, 0);
     const int64_t last = std::min(i + radius_, n - 1);
@@ -51,7 +51,7 @@ class Filter {
     return last - first + 1;
   }
 
-  // One line of n pixels, given with room for `radius` more on each side; those are filled here.
+  // Filters one line of n pixels. It has room for `radius` more on each side, which are filled here.
   template <int L>
   TORCHKCREG_INLINE void along(scalar_t* padded, int64_t n, scalar_t* out) const {
     scalar_t* line = padded + radius_;
@@ -60,7 +60,7 @@ class Filter {
     const scalar_t* taps = transposed_ ? flipped_.data() : kernel_.data();
     weigh_lines<scalar_t, L>(taps_, taps, [&](int64_t t) { return padded + t; }, n, out);
     if (!transposed_) return;
-    // What taps would have written beyond an end, most of it from the pixels next to it.
+    // Contributions that taps would have written beyond an end, mostly from the pixels next to it.
     scalar_t before = 0, behind = 0;
     for (int64_t j = 0; j < std::min(radius_, n); ++j) {
       for (int64_t t = 0; t < radius_ - j; ++t) before += kernel_[t] * line[j];
@@ -80,7 +80,7 @@ template <typename scalar_t>
 struct BlurTask {
   const scalar_t* from;
   scalar_t* to;
-  int64_t rows, cols, begin, end;  // of the image; which rows of it are made
+  int64_t rows, cols, begin, end;  // of the image; the range of rows to compute
 };
 
 template <typename scalar_t, int L>

@@ -1,12 +1,12 @@
-// One build for every processor of an architecture: hot functions are compiled once per instruction set, and the loader
-// picks. Inlined callees are compiled along (flatten), so templates below a marked function need no mark of their own.
+// One build for all processors of an architecture: hot functions are compiled once per instruction set, and the loader
+// selects one. Callees are inlined (flatten), so templates called by a marked function need no mark themselves.
 
 #pragma once
 
 #if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
 #if __GNUC__ >= 12
 #define TORCHKCREG_MULTIVERSION __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default"), flatten))
-#else  // the names of whole levels are newer than these compilers
+#else  // these compilers do not know the names of x86-64 levels
 #define TORCHKCREG_MULTIVERSION __attribute__((target_clones("avx512f", "avx2", "default"), flatten))
 #endif
 #else

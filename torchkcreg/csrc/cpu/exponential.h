@@ -1,4 +1,4 @@
-// exp(x) of short vectors, to the last bits: 2^n exp(r) with |r| <= ln(2) / 2 and a polynomial for exp(r).
+// exp(x) of short vectors, accurate to the last bits: 2^n exp(r) with |r| <= ln(2) / 2 and a polynomial for exp(r).
 
 #pragma once
 
@@ -14,12 +14,12 @@ template <typename scalar_t, int L>
 TORCHKCREG_INLINE typename Simd<scalar_t, L>::V exponential(typename Simd<scalar_t, L>::V x) {
   using S = Simd<scalar_t, L>;
   constexpr bool single = sizeof(scalar_t) == 4;
-  // Beyond these the result would be no normal number; below, it is as good as 0. In this order NaN stays NaN.
+  // Outside this range the result is not a normal number; below it, it is practically 0. This order preserves NaN.
   x = S::smaller(S::spread(single ? 88.0 : 709.0), S::larger(S::spread(single ? -87.0 : -708.0), x));
   const typename S::V scaled = x * scalar_t(1.4426950408889634);
   const typename S::I n = S::truncate(scaled + (scaled < 0 ? S::spread(-0.5) : S::spread(0.5)));
   const typename S::V whole = S::number(n);
-  // ln(2) in two parts, the first with few bits, so that its multiples are exact
+  // ln(2) in two parts; the first has few bits, so that its multiples are exact
   typename S::V r = x - whole * scalar_t(single ? 0.693359375 : 6.93145751953125e-1);
   r -= whole * scalar_t(single ? -2.12194440e-4 : 1.42860682030941723212e-6);
   typename S::V y;

@@ -1,4 +1,4 @@
-// Sums of shifted lines, which separable filters are made of.
+// Weighted sums of shifted lines, the building block of separable filters.
 
 #pragma once
 
@@ -9,7 +9,7 @@
 
 namespace torchkcreg {
 
-// out[i] = sum_k weight[k] * row[k][i] for i in [0, count): accumulators stay in registers whatever the number of rows.
+// out[i] = sum_k weight[k] * row[k][i] for i in [0, count): accumulators stay in registers for any number of rows.
 template <typename scalar_t, int L, int B, typename Row>
 TORCHKCREG_INLINE void weigh_block(int64_t rows, const scalar_t* weight, const Row& row, int64_t i, scalar_t* out) {
   using S = Simd<scalar_t, L>;

@@ -1,5 +1,6 @@
 // CPU kernel of the mesh projector: signed depths of projected triangles, integrated over each pixel, and the gradient.
-// A task is a band of an image's rows and takes triangle after triangle, so sums don't depend on the number of threads.
+// Each task handles a band of image rows and loops over the triangles in order, so sums don't depend on the number of
+// threads.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
@@ -102,8 +103,8 @@ TORCHKCREG_MULTIVERSION void add_band(const MeshProblem& p, int64_t image, int64
   }
 }
 
-// What a change of a triangle's corners does to the sum over its pixels of gradient times integral: the outline sweeps
-// area (Reynolds), and 1 / w changes inside.
+// Derivative, with respect to a triangle's corners, of the sum over its pixels of gradient times integral: the outline
+// sweeps area (Reynolds transport theorem), and 1 / w changes inside.
 struct CornerGradients {
   double shares[3] = {0, 0, 0};  // -integral of share / w^2: to the corners' w
   double outline[3][2] = {{0, 0}, {0, 0}, {0, 0}};
@@ -114,7 +115,7 @@ struct CornerGradients {
 
   TORCHKCREG_INLINE void add_part(const Planes& planes, const Polygon& polygon, double gradient) {
     const Corner& a = polygon.corners[0];
-    for (int i = 1; i + 1 < polygon.count; ++i) {  // three middles of edges are exact for quadratic functions
+    for (int i = 1; i + 1 < polygon.count; ++i) {  // the midpoints of the edges integrate quadratic functions exactly
       const Corner &b = polygon.corners[i], &c = polygon.corners[i + 1];
       const double weight = gradient * doubled(a, b, c) / 6;
       const Corner* edges[3][2] = {{&a, &b}, {&b, &c}, {&c, &a}};
@@ -147,7 +148,7 @@ TORCHKCREG_MULTIVERSION void add_band_gradient(const MeshProblem& p, int64_t ima
   for (int64_t number = 0; number < p.triangles; ++number) {
     const Polygon triangle = p.triangle(image, number);
     const Planes planes(triangle);
-    if (planes.sense == 0) continue;  // a face that is seen as a line has no side to move to
+    if (planes.sense == 0) continue;  // a face seen edge-on has zero area
     CornerGradients sums;
     bool any = false;
     const auto part = [&](int64_t row, int64_t col, const Polygon& polygon) {
@@ -169,7 +170,7 @@ TORCHKCREG_MULTIVERSION void add_band_gradient(const MeshProblem& p, int64_t ima
     };
     each_pixel(triangle, first, last, p.cols, part, whole);
     if (!any) continue;
-    for (int i = 0; i < 3; ++i) {  // w stays with a corner that moves: where the corner was, it falls by the slope
+    for (int i = 0; i < 3; ++i) {  // a moving corner keeps its w: at the old position, w decreases by the slope
       double* to = to_corners + p.faces[3 * number + i] * 3;
       to[0] += sums.outline[i][0] - sums.shares[i] * planes.slope_u;
       to[1] += sums.outline[i][1] - sums.shares[i] * planes.slope_v;
@@ -223,7 +224,7 @@ Tensor mesh_lengths_backward(const Tensor& gradient_, const Tensor& corners_, co
   Tensor result = torch::stable::new_zeros(corners, {p.images, p.vertices, 3});
   double* sums = result.mutable_data_ptr<double>();
   const int64_t size = p.vertices * 3;
-  std::vector<double> bands(p.bands() * size);  // of one image at a time: many views would take gigabytes
+  std::vector<double> bands(p.bands() * size);  // one image at a time: all views at once could take gigabytes
   for (int64_t image = 0; image < p.images; ++image) {
     std::fill(bands.begin(), bands.end(), 0.0);
     torch::stable::parallel_for(0, p.bands(), 1, [&](int64_t begin, int64_t end) {

@@ -1,4 +1,4 @@
-// A projected triangle's part of each pixel: convex polygons that together are the triangle.
+// Clips a projected triangle to pixels: convex polygons that together make up the triangle.
 
 #pragma once
 
@@ -17,9 +17,9 @@ struct Corner {
 };
 
 struct Polygon {
-  static constexpr int kMost = 12;  // a triangle cut by four lines has seven corners; those that fall together count
+  static constexpr int kMost = 12;  // a triangle cut by four lines has seven corners, more if some coincide
   Corner corners[kMost];
-  int side[kMost];  // of the triangle's, on which the edge that follows a corner lies; -1: a pixel's border
+  int side[kMost];  // side of the triangle on which the edge after each corner lies; -1: a pixel's border
   int count = 0;
 
   TORCHKCREG_INLINE void add(const Corner& corner, int on) {
@@ -40,7 +40,7 @@ TORCHKCREG_INLINE void split(const Polygon& whole, int axis, double line, Polygo
     const double share = from / (from - to);
     for (int k = 0; k < 3; ++k) crossing.at[k] = a.at[k] + share * (b.at[k] - a.at[k]);
     crossing.at[axis] = line;
-    // where the outline leaves a half the border follows; in the other half the edge goes on
+    // where the outline leaves one half, that half continues along the border, and the other along the edge
     (from < 0 ? below : above).add(crossing, -1);
     (from < 0 ? above : below).add(crossing, whole.side[i]);
   }
@@ -58,7 +58,7 @@ TORCHKCREG_INLINE Extent extent(const Polygon& polygon, int axis) {
   return e;
 }
 
-// Where pixels of a row lie wholly inside a triangle: columns [begin, end) of those given.
+// Finds the pixels of a row that lie wholly inside a triangle: columns [begin, end).
 struct Inside {
   double along_u[3], along_v[3], constant[3], inverse[3];  // edge functions, positive inside
   bool flat;
@@ -68,7 +68,7 @@ struct Inside {
     const double area =
         (c[1].at[0] - c[0].at[0]) * (c[2].at[1] - c[0].at[1]) - (c[1].at[1] - c[0].at[1]) * (c[2].at[0] - c[0].at[0]);
     const double sense = area > 0 ? 1 : -1;
-    flat = std::abs(area) < 2;  // too small to hold a pixel, or an edge
+    flat = std::abs(area) < 2;  // too small to contain a pixel, or seen edge-on
     for (int i = 0; i < 3 && !flat; ++i) {
       const Corner &a = c[i], &b = c[(i + 1) % 3];
       along_u[i] = -sense * (b.at[1] - a.at[1]), along_v[i] = sense * (b.at[0] - a.at[0]);
@@ -96,8 +96,9 @@ struct Inside {
 };
 
 // Calls `part(row, col, polygon)` for pixels that a triangle's outline cuts and `whole(row, begin, end)` for runs of
-// pixels inside it, of rows [first, last) and columns [0, cols). An edge on the border of two pixels is the second's,
-// for the triangles on either side of it; or else neither sees that one gains what the other loses when it moves.
+// pixels inside it, of rows [first, last) and columns [0, cols). An edge on the border of two pixels counts for the
+// second one, for both triangles that share it. Otherwise the gradient would miss that, when the edge moves, one
+// triangle gains what the other loses.
 template <typename Part, typename Whole>
 TORCHKCREG_INLINE void each_pixel(const Polygon& triangle, int64_t first, int64_t last, int64_t cols, const Part& part,
                                   const Whole& whole) {

@@ -1,6 +1,6 @@
-// CPU kernels of the point-cloud DRR: how the work is split. What a task does is in point_drr_tiles.h.
+// CPU kernels of the point-cloud DRR: splits the work into tasks. The tasks themselves are in point_drr_tiles.h.
 //
-// Sums in a fixed order whatever the number of threads: forward, every chunk of nodes draws a tile of its own, and
+// The order of sums does not depend on the number of threads. Forward, each chunk of nodes draws its own tile, and
 // tiles are added to an image in the order of chunks, each row by one thread. Backward, a chunk's gradients belong to
 // one task, which takes views and (where volumes share a gradient) candidates in order.
 
@@ -83,7 +83,7 @@ void gather_gradients(const Problem& p, const Inputs<scalar_t>& in, const scalar
       gather(p, in, grad, b, v, c, scratch, tile, to);
     }
   };
-  // Candidates share the volumes, so then a task takes a chunk through all of them.
+  // Candidates share the gradient of the volumes, so one task handles a chunk for all candidates.
   const int64_t outer = out.volumes ? 1 : p.candidates, inner = out.volumes ? p.candidates : 1;
   torch::stable::parallel_for(0, outer * chunks, 1, [&](int64_t begin, int64_t stop) {
     const auto scratch = std::make_unique<ChunkView<scalar_t>>();

@@ -1,8 +1,8 @@
-// A chunk of nodes as one view sees it.
+// A chunk of nodes projected in one view.
 //
 // A chunk is a run of consecutive nodes of one block, so it shares a footprint table, and (nodes being in Morton order)
 // projects to a small patch of the detector. Loops work on a tile of that size: tile, table and scratch stay in the
-// nearest caches, taps need no bounds check, and what to sum with whom depends on the problem alone, never on threads.
+// nearest caches, taps need no bounds check, and the order of sums does not depend on the number of threads.
 
 #pragma once
 
@@ -90,7 +90,7 @@ TORCHKCREG_INLINE int64_t project_nodes(const scalar_t* TORCHKCREG_RESTRICT poin
   return seen;
 }
 
-// Closes the gaps that unseen nodes leave; on return `node` tells where each one comes from.
+// Removes nodes that miss the detector; on return `node` holds the original index of each remaining one.
 template <typename scalar_t>
 TORCHKCREG_INLINE void compact_nodes(int64_t count, int64_t seen, ChunkView<scalar_t>& chunk) {
   chunk.count = seen;

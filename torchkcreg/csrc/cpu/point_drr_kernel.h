@@ -14,13 +14,13 @@ namespace torchkcreg {
 // Nodes at a time for which weights or products are kept between a loop that vectorises over nodes and one over taps.
 constexpr int64_t kBatch = 128;
 
-// Index of a node's first pixel in a patch with so many columns.
+// Index of a node's first pixel in a patch with the given number of columns.
 template <typename scalar_t>
 TORCHKCREG_INLINE int32_t patch_offset(const ChunkView<scalar_t>& chunk, int32_t cols, int64_t i) {
   return (chunk.row[i] - chunk.patch.row_begin) * cols + chunk.col[i] - chunk.patch.col_begin;
 }
 
-// Weights of the four corners, and where the taps go, for a batch of nodes.
+// Weights of the four corners and positions of the taps, for a batch of nodes.
 template <typename scalar_t>
 struct BatchWeights {
   alignas(64) scalar_t weights[4 * kBatch];
@@ -54,7 +54,7 @@ TORCHKCREG_INLINE void spread_nodes(ChunkView<scalar_t>& chunk, const TableShape
   BatchWeights<scalar_t> batch;
   if constexpr (Taps<scalar_t, T>::kHasCells) {
     const int64_t rows = chunk.patch.rows() - (T - 1), cols = chunk.patch.cols() - (T - 1);
-    // Nodes that are strewn about seldom meet, and then cells would only cost.
+    // Scattered nodes rarely share pixels, and then cells only add cost.
     if (chunk.count > 0 && rows * cols <= chunk.count) {
       scalar_t* cells = aligned_zeros(rows * cols * T * T, chunk.cells);
       for (int64_t first = 0; first < chunk.count; first += kBatch) {
@@ -85,7 +85,7 @@ struct ChunkGradients {
   double* matrix;     // (3, 4), added to; may be null
 };
 
-// What the image's gradient says of a batch of nodes: of (U, V, W) = P (x, y, z, 1), and of the volume.
+// Gradient of a batch of nodes from the image's gradient: for (U, V, W) = P (x, y, z, 1) and for the volume.
 template <typename scalar_t>
 struct BatchGradients {
   alignas(64) scalar_t u[kBatch], v[kBatch], w[kBatch], volume[kBatch];

@@ -14,7 +14,7 @@ namespace torchkcreg {
 
 constexpr int64_t kMaxTaps = 64;
 
-// Any width; T == 0 stands for a width known at run time only.
+// Any width; T == 0 means that the width is known only at run time.
 template <typename scalar_t, int T>
 struct Taps {
   static constexpr bool kHasCells = false;
@@ -44,7 +44,7 @@ struct Taps {
     const scalar_t* below = corner + phase_stride * area;
     const scalar_t* corners[4] = {corner, corner + area, below, below + area};
     for (int k = 0; k < 4; ++k) {
-      // A sum for each column, so that the loop over columns vectorises without reordering a sum.
+      // One sum per column, so that the loop over columns vectorises without reordering a sum.
       scalar_t sums[T ? T : kMaxTaps] = {};
       for (int64_t r = 0; r < width; ++r) {
         for (int64_t c = 0; c < width; ++c) sums[c] += tile[r * tile_stride + c] * corners[k][r * width + c];
@@ -74,8 +74,8 @@ struct Taps<scalar_t, 4> {
     }
   }
 
-  // Consecutive nodes share pixels, and a load that overlaps a recent store in part waits for it. So nodes are summed
-  // by first pixel, 16 taps in a cell of their own, where loads and stores coincide or don't meet.
+  // Consecutive nodes share pixels, and a load that partly overlaps a recent store stalls. So nodes are summed by
+  // first pixel, each pixel with its own cell of 16 taps, where loads and stores coincide or don't overlap.
   TORCHKCREG_INLINE void add_to_cell(const scalar_t* TORCHKCREG_RESTRICT corner,
                                      const scalar_t* TORCHKCREG_RESTRICT weight,
                                      scalar_t* TORCHKCREG_RESTRICT cell) const {
@@ -90,7 +90,7 @@ struct Taps<scalar_t, 4> {
                                      scalar_t* TORCHKCREG_RESTRICT tile) const {
     const Vector4 zero = {};
     for (int64_t r = 0; r < rows; ++r) {
-      Vector4 window[4] = {};  // for each row of taps, what cells so far add to this and the next three columns
+      Vector4 window[4] = {};  // for each row of taps, sum of the cells so far in this and the next three columns
       for (int64_t c = 0; c < cols + 3; ++c) {
         for (int64_t k = 0; k < 4; ++k) {
           window[k] = __builtin_shufflevector(window[k], zero, 1, 2, 3, 4);

@@ -1,4 +1,4 @@
-// What a task of the point-cloud DRR does: draw one chunk of nodes in one view, or gather its gradients.
+// Tasks of the point-cloud DRR: draw one chunk of nodes in one view, or gather its gradients.
 
 #pragma once
 
@@ -84,8 +84,8 @@ TORCHKCREG_INLINE void gather_tile(const Problem& p, const Inputs<scalar_t>& in,
                             in.volumes + p.chunk_begin(chunk), in.matrices + 12 * view, tile.pixels.data(), out);
 }
 
-// target_clones works on plain functions only, hence one of them for every case that is worth code of its own: 4 taps
-// for fine lattices, 6 and 8 for coarsened ones.
+// target_clones works only on plain functions, hence one function for each specialised width: 4 taps for fine lattices,
+// 6 and 8 for coarsened ones.
 #define TORCHKCREG_TILE_FUNCTIONS(scalar_t, T)                                                                   \
   TORCHKCREG_MULTIVERSION inline void draw_##scalar_t##_##T(const Problem& p, const Inputs<scalar_t>& in,        \
                                                             int64_t candidate, int64_t view, int64_t chunk,      \

@@ -55,7 +55,7 @@ struct Simd {
 #endif
     return gather(table, i);
   }
-  // Between table[i] and table[i + 1], likewise, where reach is below 2 L.
+  // Interpolates between table[i] and table[i + 1], with the same conditions, for reach below 2 L.
   static TORCHKCREG_INLINE V between_near(const scalar_t* table, I i, V fraction, int64_t first) {
 #ifndef __clang__
     const V low = load(table + first), high = load(table + first + L);

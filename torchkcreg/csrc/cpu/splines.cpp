@@ -1,5 +1,5 @@
-// CPU kernel of cubic B-splines at scattered points, which come sorted by the knot cell that they lie in. A task is a
-// run of points; each of them is its own sum, so results don't depend on the number of threads.
+// CPU kernel of cubic B-splines at scattered points, which are sorted by knot cell. Each task handles a run of points.
+// Each point has its own sum, so results don't depend on the number of threads.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>

@@ -1,6 +1,6 @@
 // CPU kernel of the transmitted signal behind several materials: exponentials over energies, the system's blur and the
-// averaging over a pixel's sub-pixels in one pass. A task is the image of one candidate and view, and its pixels are
-// its own, so sums don't depend on the number of threads.
+// averaging over a pixel's sub-pixels in one pass. Each task computes the image of one candidate and view, and no
+// other task writes to it, so sums don't depend on the number of threads.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
@@ -49,7 +49,7 @@ struct TransmissionInputs {
         weights(w.const_data_ptr<scalar_t>()),
         kernel(k.const_data_ptr<scalar_t>()) {}
 
-  // What one task, of candidate k and view v, works with.
+  // Inputs and outputs of the task of candidate k and view v.
   TransmissionImage<scalar_t> image(const TransmissionShape& p, int64_t k, int64_t v) const {
     const int64_t pixels = p.rows * p.cols;
     return {lengths + (k * p.materials * p.views + v) * pixels, p.views * pixels, attenuation,

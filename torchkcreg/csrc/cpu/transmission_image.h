@@ -11,7 +11,7 @@
 
 namespace torchkcreg {
 
-constexpr int64_t kPixelsPerSum = 4096;  // in the numbers' own precision; these sums are then added in double
+constexpr int64_t kPixelsPerSum = 4096;  // summed in scalar_t; these sums are then added in double
 
 struct TransmissionShape {
   int64_t candidates, materials, views, rows, cols, energies, taps, pooling;
@@ -20,7 +20,7 @@ struct TransmissionShape {
 template <typename scalar_t>
 struct TransmissionImage {
   const scalar_t* lengths;  // of the first material
-  int64_t next_material;    // how far behind it the next one's are
+  int64_t next_material;    // offset to the lengths of the next material
   const scalar_t *attenuation, *weights, *kernel;
 };
 
@@ -28,7 +28,7 @@ template <typename scalar_t>
 struct ImageGradients {
   scalar_t* lengths;
   int64_t next_material;
-  double* attenuation;  // null where none is needed
+  double* attenuation;  // null if not needed
   scalar_t* weights;
   double* kernel;
 };
@@ -120,7 +120,7 @@ TORCHKCREG_INLINE double dot(const scalar_t* x, const scalar_t* y, int64_t count
 
 inline int64_t clamped(int64_t i, int64_t count) { return std::min(std::max<int64_t>(i, 0), count - 1); }
 
-// Correlates along the first dimension, the border repeated; the adjoint spreads in place of gathering.
+// Correlates along the first dimension with replicated border; the adjoint scatters instead of gathering.
 template <typename scalar_t, int L>
 TORCHKCREG_INLINE void blur_rows(const TransmissionShape& p, const scalar_t* kernel, const scalar_t* from, scalar_t* to,
                                  bool adjoint) {

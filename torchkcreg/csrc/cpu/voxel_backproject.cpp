@@ -1,5 +1,5 @@
-// CPU kernel of the voxel projector's adjoint. A task is a few lattice planes of an axis, and adds to them whatever
-// rays are sampled there, view after view; so a voxel's sum has a fixed order whatever the number of threads.
+// CPU kernel of the voxel projector's adjoint. Each task handles a few lattice planes of an axis and adds all rays
+// sampled there, view after view, so the order of a voxel's sum does not depend on the number of threads.
 
 #include <torch/csrc/stable/library.h>
 
@@ -14,7 +14,7 @@ constexpr int64_t kBlockPlanes = 4;
 constexpr int64_t kBlockColumns = 16;
 constexpr int64_t kPixelsAtOnce = int64_t(1) << 23;  // bounds the memory
 
-// A view made ready for the tasks: pixels times the millimetres between planes on their rays, column by column.
+// A view prepared for the tasks: pixels times the distance in mm between planes along their rays, column by column.
 template <typename scalar_t>
 struct PreparedView {
   const RayView* view;
@@ -95,7 +95,7 @@ TORCHKCREG_INLINE void spread_upright_view(const VoxelProblem& p, const Prepared
   }
 }
 
-// One ray after another; the frame of the lattice takes what falls beside the volume.
+// One ray after another; contributions outside the volume go to the frame of the lattice.
 template <typename scalar_t>
 TORCHKCREG_INLINE void spread_tilted_view(const VoxelProblem& p, const PreparedView<scalar_t>& from, int axis,
                                           PlaneRange block, Lattice<scalar_t>& lattice) {

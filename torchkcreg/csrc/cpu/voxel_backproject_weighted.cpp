@@ -1,8 +1,9 @@
-// CPU kernel of FDK's back-projection: each voxel samples the filtered images where it projects to, over the squared
-// depth. A task is a few rows of columns of voxels, and takes view after view; so a sum's order is fixed.
+// CPU kernel of FDK's back-projection: each voxel samples the filtered images at its projection, divided by the
+// squared depth. Each task handles a few rows of voxel columns, view after view, so the order of sums is fixed.
 //
 // Where detector columns are parallel to z, a column of voxels lies between two detector columns at a constant depth:
-// these are blended, and the blend is sampled at equal steps. Other columns of voxels go some voxels abreast.
+// these are blended, and the blend is sampled at equal steps. Otherwise several voxels of a column are processed
+// together.
 
 #include <torch/csrc/stable/library.h>
 
@@ -37,7 +38,8 @@ struct WeightedProblem {
 inline PixelView read_pixel_view(const double* matrix, const int64_t* counts, int64_t rows) {
   PixelView view;
   for (int k = 0; k < 12; ++k) view.matrix[k / 4][k % 4] = matrix[k];
-  // Along a column of voxels u drifts by d(P0/P2), v bends by as much as the depth drifts; both in pixels, or so.
+  // Along a column of voxels u changes by d(P0/P2), and v is nonlinear by as much as the depth changes; both roughly in
+  // pixels.
   const auto& m = view.matrix;
   const double depth = std::abs(m[2][3] + (m[2][0] * double(counts[0]) + m[2][1] * double(counts[1])) / 2);
   const double pixels = double(rows) + std::abs(m[1][3]) / std::max(depth, 1e-300);
@@ -66,7 +68,7 @@ TORCHKCREG_INLINE void add_upright_column(const WeightedProblem& p, const PixelV
            view.matrix[k][2] * (k == 1 ? 0 : double(p.counts[2] - 1) / 2) + view.matrix[k][3];
   }
   if (!(h[2] > 0)) return;
-  const double weight = 1 / (h[2] * h[2]), u = h[0] / h[2] + 1;  // u, v count from the frame
+  const double weight = 1 / (h[2] * h[2]), u = h[0] / h[2] + 1;  // u, v include the frame
   if (!(u > 0 && u < double(p.cols + 1))) return;
   const double bottom = h[1] / h[2], step = std::abs(view.matrix[1][2] / h[2]);
   const double start = view.flipped ? double(p.rows - 1) - bottom : bottom;
@@ -101,7 +103,7 @@ TORCHKCREG_INLINE void add_tilted_column(const WeightedProblem& p, const PixelVi
     for (int k = 0; k < 3; ++k) {
       at[k] = ramp * scalar_t(view.matrix[k][2]) + scalar_t(h[k] + view.matrix[k][2] * double(z));
     }
-    const V inverse = at[2] > zero ? one / at[2] : zero;  // weighs nothing behind the source
+    const V inverse = at[2] > zero ? one / at[2] : zero;  // zero weight behind the source
     const V u = S::smaller(S::larger(at[0] * inverse + one, zero), last_u);
     const V v = S::smaller(S::larger(at[1] * inverse + one, zero), last_v);
     const I col = S::truncate(S::smaller(u, last_u - one)), row = S::truncate(S::smaller(v, last_v - one));

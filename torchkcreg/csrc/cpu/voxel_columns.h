@@ -11,12 +11,12 @@
 namespace torchkcreg {
 namespace {
 
-constexpr int64_t kColumnPad = 16;  // elements before index 0 of a padded column; one would do, but for alignment
+constexpr int64_t kColumnPad = 16;  // elements before index 0 of a padded column; one would do, the rest is alignment
 
 // Elements that a padded column of count needs, from its very start.
 inline int64_t padded_size(int64_t count) { return kColumnPad + count + 2 + kMaxReadAhead; }
 
-// Elements that the samples of gather_resampled need, which may read as far again as there are samples.
+// Elements that the samples of gather_resampled need; it may read that many again past their end.
 inline int64_t padded_samples(int64_t count) { return 2 * count + 2 + kMaxReadAhead; }
 
 // Elements [begin, end).
@@ -74,7 +74,7 @@ TORCHKCREG_INLINE void gather_resampled(const scalar_t* TORCHKCREG_RESTRICT samp
   const int64_t taps = static_cast<int64_t>(std::min(2 * inverse, double(count))) + 1;
   const int64_t reach = static_cast<int64_t>((L - 1) * inverse) + 2;
   const typename S::V low = S::spread(0), high = S::spread(scalar_t(count)), one = S::spread(1);
-  // One more than the last sample at or below k - 1, that is the first sample that k feels.
+  // One more than the last sample at or below k - 1, i.e. the first sample that contributes to k.
   const typename S::V ramp = S::ramp() * scalar_t(inverse) + scalar_t((-1 - start) * inverse + 1);
   for (int64_t k = range.begin / L * L; k < range.end; k += L) {
     const typename S::V edge = S::smaller(S::larger(ramp + scalar_t(inverse) * scalar_t(k), low), high);

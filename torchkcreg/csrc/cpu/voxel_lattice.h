@@ -1,5 +1,5 @@
-// A copy of a volume in the order that the voxel kernels like: z innermost, and a frame of zeros around it, so that
-// interpolation at the border needs no bounds check and back-projection beyond it does no harm.
+// A copy of a volume in the memory order of the voxel kernels: z innermost, with a frame of zeros around it, so that
+// interpolation at the border needs no bounds check and back-projection beyond it stays in the buffer.
 
 #pragma once
 
@@ -19,7 +19,7 @@ class Lattice {
 
   // Counts of voxels along x, y, z.
   explicit Lattice(const int64_t* counts) : counts_{counts[0], counts[1], counts[2]} {
-    // An odd number of cache lines, so that neighbouring columns don't compete for the same places in a cache.
+    // An odd number of cache lines, so that neighbouring columns don't compete for the same cache sets.
     pitch_ = ((counts[2] + 2 + kLine - 1) / kLine | 1) * kLine;
     values_.assign((counts[0] + 2) * (counts[1] + 2) * pitch_ + kLine, scalar_t(0));
   }

@@ -1,6 +1,6 @@
-// Rays along a detector column or row that is not parallel to z, for the views that are not upright. From a lattice
-// plane to the next they move together: some that are neighbours lie between few columns of voxels, each read for all
-// of them.
+// Rays along a detector column or row that is not parallel to z, for views that are not upright. Neighbouring rays
+// move together from one lattice plane to the next and lie between few columns of voxels, so each column is read once
+// for several rays.
 
 #pragma once
 
@@ -16,8 +16,9 @@
 namespace torchkcreg {
 namespace {
 
-// The rays of a line that share a major axis and their sense along it. The others repeat a neighbour and weigh nothing,
-// so that positions on a plane are monotonic along the line, and the first and the last of some bound those between.
+// The rays of a line that share a major axis and their sense along it. Other rays copy a neighbour with zero
+// weight, so that positions on a plane are monotonic along the line, and the first and last ray of a group bound those
+// between.
 template <typename scalar_t>
 struct RayLine {
   std::vector<scalar_t> start[2], slope[2];  // index along the other axes: start + plane * slope
@@ -45,14 +46,14 @@ struct RayLine {
   TORCHKCREG_INLINE void read_senses(const RayView& view, int64_t line, int64_t rays) {
     count = rays;
     sense[0] = sense_of(view, line, 0);
-    if (sense[0] == sense_of(view, line, rays - 1)) {  // the directions of a sense are a convex cone
+    if (sense[0] == sense_of(view, line, rays - 1)) {  // the directions with one sense form a convex cone
       std::fill_n(sense.begin(), rays, sense[0]);
     } else {
       for (int64_t n = 1; n < rays; ++n) sense[n] = sense_of(view, line, n);
     }
   }
 
-  // False where no ray has this sense.
+  // False if no ray has this sense.
   TORCHKCREG_INLINE bool select(const RayView& view, int64_t line, int8_t which, const int64_t* counts,
                                 const double* spacing) {
     begin = std::find(sense.begin(), sense.begin() + count, which) - sense.begin();
@@ -77,7 +78,7 @@ struct RayLine {
       }
       for (int k = 0; k < 3; ++k) square += d[k] * spacing[k] * d[k] * spacing[k];
       length[n] = sense[n] == which ? scalar_t(std::sqrt(square) * std::abs(inverse)) : scalar_t(0);
-      if (low - high > 2) continue;  // misses the volume, rounding allowed for
+      if (low - high > 2) continue;  // misses the volume, with a margin for rounding
       lowest = std::min(lowest, low), highest = std::max(highest, high);
     }
     for (int k = 0; k < 2; ++k) {  // vectors may run over the end
@@ -109,7 +110,7 @@ struct LineCrossing {
     }
   }
 
-  // All of them are in the frame, on one side of the volume.
+  // True if all rays are in the frame, on one side of the volume.
   TORCHKCREG_INLINE bool beside(const scalar_t* high) const {
     bool result = false;
     for (int k = 0; k < 2; ++k) {
@@ -119,14 +120,14 @@ struct LineCrossing {
     return result;
   }
 
-  // Of column `c` of voxels in what lies between columns.
+  // Interpolation weight of column `c` of voxels.
   TORCHKCREG_INLINE typename S::V share(int64_t c) const {
     const typename S::V offset = position[0] - scalar_t(c), one = S::spread(1);
     return S::larger(S::smaller(one + offset, one - offset), S::spread(0));
   }
 };
 
-// sums[n] += what ray n meets, plane after plane, and up to a vector beyond the last.
+// sums[n] += samples of ray n, plane after plane; may write up to a vector beyond the last.
 template <typename scalar_t, int L>
 TORCHKCREG_INLINE void add_line(const RayLine<scalar_t>& line, const Lattice<scalar_t>& lattice, const int64_t* counts,
                                 scalar_t* sums) {
@@ -144,7 +145,8 @@ TORCHKCREG_INLINE void add_line(const RayLine<scalar_t>& line, const Lattice<sca
       const LineCrossing<scalar_t, L> at(line, n, plane, high);
       if (at.beside(high)) continue;
       for (const int64_t c : {at.first[0], at.first[0] + 1}) {
-        prefetch(from + lattice.stride(axis) + c * across + at.first[1] * along);  // there they will be about as far
+        prefetch(from + lattice.stride(axis) + c * across +
+                 at.first[1] * along);  // about the same place on the next plane
       }
       const V fraction = at.position[1] - S::number(at.below[1]);
       V sum = S::spread(0);

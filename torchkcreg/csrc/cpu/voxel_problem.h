@@ -1,4 +1,4 @@
-// What the voxel operators share: sizes, checks, views.
+// Shared by the voxel operators: sizes, checks, views.
 
 #pragma once
 
@@ -33,7 +33,7 @@ inline void check_data(const torch::stable::Tensor& data, const char* shape) {
                   "data must be float32 or float64");
 }
 
-// Images (B, V, rows, cols) where they are: a slice of the views is read in place, only pixels have to be contiguous.
+// Images (B, V, rows, cols) without a copy: a slice of views is read in place; only pixels must be contiguous.
 template <typename scalar_t>
 struct ImageStack {
   const scalar_t* first;
@@ -57,7 +57,7 @@ inline torch::stable::Tensor check_matrices(const torch::stable::Tensor& matrice
   return torch::stable::contiguous(matrices);
 }
 
-// Sizes that kernels can count with 32 bits where it matters.
+// Checks that sizes fit the 32-bit indices used in the kernels.
 inline void check_sizes(const int64_t* counts, int64_t rows, int64_t cols) {
   constexpr int64_t kMost = int64_t(1) << 20, kElements = int64_t(1) << 31;
   for (const int64_t n : {counts[0], counts[1], counts[2], rows, cols}) {

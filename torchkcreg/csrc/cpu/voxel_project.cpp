@@ -1,8 +1,9 @@
-// CPU kernel of the voxel projector. A task is a block of detector columns (or rows) of a view, and its pixels are its
-// own, so sums don't depend on the number of threads.
+// CPU kernel of the voxel projector. Each task computes a block of detector columns (or rows) of a view, and no
+// other task writes there, so sums don't depend on the number of threads.
 //
 // Where detector columns are parallel to z, a whole column of rays crosses each plane between the same two columns of
-// voxels: these are blended, and the blend is sampled at equal steps. Elsewhere the rays of a line go some abreast.
+// voxels: these are blended, and the blend is sampled at equal steps. Otherwise several rays of a line are processed
+// together.
 
 #include <torch/csrc/stable/library.h>
 

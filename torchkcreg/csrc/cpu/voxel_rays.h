@@ -1,4 +1,4 @@
-// The rays of a view in voxel indices, and which lattice planes they are sampled on; projector/voxel_reference.py
+// The rays of a view in voxel indices, and the lattice planes on which they are sampled; projector/voxel_reference.py
 // defines what the kernels compute.
 
 #pragma once
@@ -35,7 +35,7 @@ struct RayView {
   }
 
   static TORCHKCREG_INLINE int major_axis(const double* d) {
-    // At 45 degrees rounding must not choose.
+    // At 45 degrees rounding must not decide.
     const double x = std::abs(d[0]), y = std::abs(d[1]) * (1 - 1e-6), z = std::abs(d[2]) * (1 - 2e-6);
     return x >= y ? (x >= z ? 0 : 2) : (y >= z ? 1 : 2);
   }
@@ -58,7 +58,7 @@ struct RayView {
   }
 };
 
-// Leaves the planes where start + plane * slope is between -1 and count, give or take one.
+// Keeps the planes where start + plane * slope is between -1 and count, to within one plane.
 TORCHKCREG_INLINE void narrow(double start, double slope, int64_t count, PlaneRange& range) {
   if (std::abs(slope) < 1e-9) {
     if (start <= -1 || start >= double(count)) range.last = range.first - 1;
@@ -79,7 +79,7 @@ struct UprightColumn {
   double step;               // of depth from plane to plane
   double climb, climb_step;  // dz at depth 1 of sample 0, and from sample to sample (positive)
   double start, slope;       // index along the other axis: start + plane * slope
-  double flat;               // squared length of the ray at depth 1 but for z, in mm^2
+  double flat;               // squared length of the ray at depth 1 without its z component, in mm^2
   PlaneRange planes;
 
   UprightColumn(const RayView& view, int64_t u, int64_t rows, const int64_t* counts, const double* spacing) {
@@ -128,8 +128,8 @@ inline RayView read_view(const double* matrix, const int64_t* counts, int64_t ro
     for (int j = 0; j < 3; ++j) view.directions[k][j] = matrix[4 * k + j];
     view.source[k] = matrix[4 * k + 3];
   }
-  // The farthest that a voxel can be from the source, in depth: |offset| over the shortest |d| would do; so would the
-  // third row of the inverse, which needs no guess.
+  // Largest depth of a voxel from the source, from the third row of the inverse (|offset| over the shortest |d| would
+  // also bound it).
   const auto& d = view.directions;
   const double cofactors[3] = {d[1][0] * d[2][1] - d[1][1] * d[2][0], d[0][1] * d[2][0] - d[0][0] * d[2][1],
                                d[0][0] * d[1][1] - d[0][1] * d[1][0]};

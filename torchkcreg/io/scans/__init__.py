@@ -1,4 +1,4 @@
-"""Projections as they are measured: files and folders of images of many kinds, to line integrals with a mask."""
+"""Measured projections: reads image files and folders of many formats as line integrals with a mask."""
 
 from .dicom import is_dicom, read_dicom_geometry
 from .images import image_header, read_image

@@ -1,4 +1,4 @@
-"""DICOM: which views a file holds, what its pixels are, and the geometry as far as its tags say it."""
+"""DICOM: file order, X-ray images, and the nominal geometry given by the tags."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NEEDED = "DICOM files need pydicom: pip install 'torchkcreg[io]'"
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether a file is DICOM: by its ending, or, where it has none, by its first bytes."""
+    """True if a file is DICOM, by its suffix or, without a suffix, by its first bytes."""
     if path.suffix.lower() in DICOM_SUFFIXES:
         return True
     if path.suffix.strip(".0123456789") or not path.is_file():
@@ -30,30 +30,30 @@ def is_dicom(path: Path) -> bool:
 
 
 def dicom_files(folder: Path) -> list[Path]:
-    """DICOM files of a folder, in the order of their instance numbers, or of the numbers in their names.
+    """DICOM files of a folder, sorted by instance number, or by the numbers in their names if it is missing.
 
     Raises:
-        ValueError: some have a number of their own, and others the same or none.
+        ValueError: Some instance numbers are missing or equal, but not all.
     """
     return list(_ordered(folder))
 
 
 def _ordered(folder: Path) -> dict[Path, Any]:
-    """Files in their order, and what each says."""
+    """DICOM files of a folder in order, with their tags."""
     tags = {file: _tags(file) for file in sorted(filter(is_dicom, folder.iterdir()), key=by_number)}
-    numbers = {file: _number(one, "InstanceNumber", 0) for file, one in tags.items()}
+    numbers = {file: _number(dataset, "InstanceNumber", 0) for file, dataset in tags.items()}
     if 1 < len(set(numbers.values())) < len(numbers):
         raise ValueError("its DICOM files do not say their order: InstanceNumber is missing or the same in some")
     return {
         file: tags[file] for file in sorted(tags, key=lambda file: numbers[file])
-    }  # as they are where all are alike
+    }  # a stable sort: equal numbers keep the order by name
 
 
 def dicom_images(path: Path) -> NDArray:
-    """The frames (V, rows, cols) of a file, in proportion to the X-ray intensity.
+    """The frames (V, rows, cols) of a file, proportional to the X-ray intensity.
 
     Raises:
-        ValueError: damaged, in colours, compressed in a way that nothing here unpacks, or prepared for display.
+        ValueError: The file is damaged, in colour, compressed in an unsupported way, or processed for display.
         ImportError: pydicom is not installed.
     """
     data = _tags(path, pixels=True)
@@ -64,10 +64,12 @@ def dicom_images(path: Path) -> NDArray:
             "ask the scanner for unprocessed images"
         )
     if _number(data, "PixelIntensityRelationshipSign", 1) < 0:
-        raise ValueError("its pixels are larger where fewer X-rays are (PixelIntensityRelationshipSign): invert them")
+        raise ValueError(
+            "its pixels are larger where fewer X-rays arrive (PixelIntensityRelationshipSign): invert them"
+        )
     try:
         images = np.asarray(data.pixel_array)
-    except Exception as error:  # pydicom's and its decoders' own
+    except Exception as error:  # pydicom and its decoders raise various types
         raise ValueError(f"{path.name} has no pixels that can be read: {str(error).splitlines()[0]}") from error
     if (samples := _number(data, "SamplesPerPixel", 1)) != 1:
         raise ValueError(f"{path.name} has {samples:g} numbers a pixel: grey images have one")
@@ -77,29 +79,30 @@ def dicom_images(path: Path) -> NDArray:
 
 
 def read_dicom_geometry(path: Path) -> ConeBeamGeometry:
-    """The geometry of an angiographic (XA) multi-frame file, or of a folder with a file a view, by its tags.
+    """The nominal geometry of an angiographic (XA) multi-frame file, or of a folder with one file per view.
 
-    The world is the patient's of a supine one at the isocentre: x to the left, y to the back, z to the head. The
-    detector is in front at angle 0, moves to the left with the primary angle (LAO) and to the head with the secondary
-    one (CRA). Rows run to the feet. DistanceSourceToPatient is taken for that to the isocentre.
+    The world is that of a supine patient, with its origin at the isocentre: x to the left, y to the back, z to the
+    head. At angle 0 the detector is in front of the patient. It moves to the left with a positive primary angle (LAO)
+    and to the head with a positive secondary angle (CRA). The row index increases towards the feet.
+    DistanceSourceToPatient is taken as the distance from source to isocentre.
 
-    These are what the scanner meant to do: C-arms sag by millimetres, which a registration's `view_motion` can find.
+    Tags hold nominal values. Real C-arms sag by millimetres; a registration's `view_motion` can estimate this.
 
     Raises:
-        ValueError: tags are missing or contradict each other, or images are flipped or turned.
+        ValueError: Tags are missing or inconsistent, or images are flipped or rotated.
     """
     tags = list(_ordered(path).values()) if path.is_dir() else [_tags(path)]
     if not tags:
         raise ValueError("holds no DICOM files")
-    shapes = {(int(_number(one, "Rows")), int(_number(one, "Columns")), *_spacing(one)) for one in tags}
+    shapes = {(int(_number(dataset, "Rows")), int(_number(dataset, "Columns")), *_spacing(dataset)) for dataset in tags}
     if len(shapes) > 1:
         raise ValueError(f"its files have pixels of different numbers or sizes: {sorted(shapes)}")
     rows, cols, *spacing = shapes.pop()
     primary, secondary = (
-        torch.cat([_angles(one, name) for one in tags]).deg2rad()
+        torch.cat([_angles(dataset, name) for dataset in tags]).deg2rad()
         for name in ("PositionerPrimaryAngle", "PositionerSecondaryAngle")
     )
-    sad, sdd = torch.cat([_distances(one) for one in tags]).T[..., None]
+    sad, sdd = torch.cat([_distances(dataset) for dataset in tags]).T[..., None]
     sin_a, cos_a, sin_b, cos_b = primary.sin(), primary.cos(), secondary.sin(), secondary.cos()
     towards = torch.stack([sin_a * cos_b, -cos_a * cos_b, sin_b], dim=1)  # from the isocentre to the detector
     across = torch.stack([cos_a, sin_a, torch.zeros_like(sin_a)], dim=1)
@@ -109,7 +112,7 @@ def read_dicom_geometry(path: Path) -> ConeBeamGeometry:
 
 
 def _spacing(tags: Any) -> tuple[float, float]:
-    """Pixel spacing (dv, du) in mm of images as the detector took them."""
+    """Pixel spacing (dv, du) on the detector, mm."""
     if _text(tags, "FieldOfViewHorizontalFlip") == "YES" or _number(tags, "FieldOfViewRotation", 0) != 0:
         raise ValueError("images are flipped or turned against the detector (FieldOfView tags): undo that first")
     spacing = _numbers(tags, "ImagerPixelSpacing")
@@ -119,7 +122,7 @@ def _spacing(tags: Any) -> tuple[float, float]:
 
 
 def _distances(tags: Any) -> Tensor:
-    """From the source to the isocentre and to the detector (frames, 2), mm."""
+    """Distances from the source to the isocentre and to the detector (frames, 2), mm."""
     sad, sdd = _number(tags, "DistanceSourceToPatient"), _number(tags, "DistanceSourceToDetector")
     if not 0 < sad < sdd:
         raise ValueError(f"DistanceSourceToPatient {sad:g} mm must lie between 0 and DistanceSourceToDetector {sdd:g}")
@@ -127,7 +130,7 @@ def _distances(tags: Any) -> Tensor:
 
 
 def _angles(tags: Any, name: str) -> Tensor:
-    """Degrees of each frame: the initial angle, and an average step or each frame's offset (PS3.3 C.8.7.5.1.3)."""
+    """Angle of each frame, degrees: initial angle plus a mean step or an offset per frame (PS3.3 C.8.7.5.1.3)."""
     frames = int(_number(tags, "NumberOfFrames", 1))
     start = _number(tags, name, 0.0 if name == "PositionerSecondaryAngle" else None)
     steps = _numbers(tags, f"{name}Increment") if f"{name}Increment" in tags else [0.0]
@@ -139,21 +142,21 @@ def _angles(tags: Any, name: str) -> Tensor:
 
 
 def _tags(path: Path, *, pixels: bool = False) -> Any:
-    """What a file says, with or without its pixels."""
+    """The tags of a file, with or without its pixels."""
     try:
         import pydicom
     except ImportError:
         raise ImportError(NEEDED) from None
     try:
         return pydicom.dcmread(path, stop_before_pixels=not pixels)
-    except Exception as error:  # pydicom's own, and what damaged files make of struct and decoders
+    except Exception as error:  # pydicom, struct and decoders raise various types on damaged files
         raise ValueError(f"{path.name} is no DICOM file that can be read") from error
 
 
 def _text(tags: Any, name: str) -> str:
     try:
         value = tags.get(name)
-    except Exception:  # as above
+    except Exception:  # damaged values raise various types
         return "damaged"
     return "" if value is None else str(value)
 
@@ -166,11 +169,11 @@ def _number(tags: Any, name: str, default: float | None = None) -> float:
 
 def _numbers(tags: Any, name: str) -> list[float]:
     try:
-        value = tags.get(name)
-        values = [float(part) for part in (value if not isinstance(value, (str, int, float)) else [value])]
-    except Exception:  # values are made of bytes when they are asked for, and damaged ones fail in many ways
-        said = (name in tags and "hold numbers") or "be there"
-        raise ValueError(f"DICOM tag {name} must {said}: give a geometry of another kind") from None
-    if not values or not all(math.isfinite(one) for one in values):
+        content = tags.get(name)
+        values = [float(part) for part in (content if not isinstance(content, (str, int, float)) else [content])]
+    except Exception:  # values are decoded on access, and damaged ones raise various types
+        requirement = (name in tags and "hold numbers") or "be there"
+        raise ValueError(f"DICOM tag {name} must {requirement}: give a geometry of another kind") from None
+    if not values or not all(math.isfinite(value) for value in values):
         raise ValueError(f"DICOM tag {name} must hold finite numbers, got {values}")
     return values

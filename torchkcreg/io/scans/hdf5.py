@@ -1,6 +1,6 @@
 """Projections in HDF5: Data Exchange, NXtomo, or any dataset by name.
 
-They are read by pyfive: HDF5's own library does not survive some damaged files.
+Files are read with pyfive, because the HDF5 library crashes on some damaged files.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from .images import can_hold
 from .series import ImageSeries
 
 HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs")
-_PROJECTION, _FLAT, _DARK = 0, 1, 2  # of NXtomo's image_key
+_PROJECTION, _FLAT, _DARK = 0, 1, 2  # values of NXtomo's image_key
 
 
 def open_hdf5(path: Path, dataset: str | None = None) -> ImageSeries:
     """The projections of an HDF5 file, with the means of its flat and dark fields.
 
-    Without a name, they are those of Data Exchange (`exchange/data`, `data_white`, `data_dark`), of NXtomo (`image_key`
-    beside `data`), or the only dataset of three dimensions.
+    Without a name, the dataset is that of Data Exchange (`exchange/data`, with `data_white` and `data_dark`), that of
+    NXtomo (`image_key` beside `data`), or the only three-dimensional dataset.
 
     Raises:
-        ValueError: no HDF5, no such dataset, or several that may be meant.
+        ValueError: The file is no HDF5, lacks the dataset, or several datasets are possible.
         ImportError: pyfive is not installed.
     """
     try:
@@ -55,10 +55,10 @@ def open_hdf5(path: Path, dataset: str | None = None) -> ImageSeries:
                     fields[kind] = _plain(data).mean(np.flatnonzero(keys == number).tolist())
 
     def read(indices: Sequence[int]) -> NDArray:
-        with _opened(pyfive, path) as again:
-            images = np.stack([np.asarray(again[name][views[index]]) for index in indices])
+        with _opened(pyfive, path) as reopened:
+            images = np.stack([np.asarray(reopened[name][views[index]]) for index in indices])
         if images.ndim != 3 or images.dtype.kind not in "uif":
-            raise ValueError(f"dataset {name} gives no images: is it a virtual one? Write it as a plain one")
+            raise ValueError(f"dataset {name} gives no images: is it a virtual dataset? Write it as a plain one")
         return images
 
     return ImageSeries(len(views), read, fields)
@@ -67,7 +67,7 @@ def open_hdf5(path: Path, dataset: str | None = None) -> ImageSeries:
 def _opened(pyfive: Any, path: Path) -> Any:
     try:
         return pyfive.File(str(path))
-    except Exception as error:  # pyfive's own, and what damaged files make of struct
+    except Exception as error:  # pyfive and struct raise various types on damaged files
         raise ValueError(f"is no HDF5 file that can be read: {(str(error).splitlines() or ['damaged'])[0]}") from error
 
 
@@ -77,7 +77,7 @@ def _chosen(stacks: dict[str, Any], dataset: str | None) -> str:
             raise ValueError(f"has no dataset {dataset} of three dimensions; it has {', '.join(stacks) or 'none'}")
         return dataset.strip("/")
     known = [name for name, data in stacks.items() if name.endswith("exchange/data") or "image_key" in data.parent]
-    measured = [name for name in known if "detector/" in name]  # others are links to it
+    measured = [name for name in known if "detector/" in name]  # the others are links to it
     for names in (known, measured, list(stacks)):
         if len(names) == 1:
             return names[0]
@@ -98,7 +98,7 @@ def _check(data: Any, name: str, path: Path) -> None:
 
 
 def _field(data: Any, name: str, shape: tuple[int, ...]) -> NDArray:
-    """A flat or dark field (rows, cols): the mean of several, or the one that there is."""
+    """A flat or dark field (rows, cols): a single image, or the mean of several."""
     if tuple(data.shape) == shape:
         return np.asarray(data[()]).astype(np.float32)
     if tuple(data.shape[1:]) != shape:
@@ -107,5 +107,5 @@ def _field(data: Any, name: str, shape: tuple[int, ...]) -> NDArray:
 
 
 def _plain(data: Any) -> ImageSeries:
-    """All images of a dataset."""
+    """All images of a dataset as a series."""
     return ImageSeries(data.shape[0], lambda indices: np.stack([np.asarray(data[int(index)]) for index in indices]))

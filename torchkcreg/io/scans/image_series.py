@@ -1,4 +1,4 @@
-"""Views' images wherever they are: one file of many, a folder of many files, raw data, HDF5, DICOM."""
+"""Image series of all formats: stacks, folders of images, raw data, HDF5, DICOM, and scan descriptions (YAML)."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from .series import ImageSeries, by_number
 
 DESCRIPTION_SUFFIXES = (".yaml", ".yml")
 STACK_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".nii.gz")
-VIEW_SUFFIXES = (*STACK_SUFFIXES, *PAGE_SUFFIXES, *DICOM_SUFFIXES)  # of which a folder may hold one file a view
+VIEW_SUFFIXES = (*STACK_SUFFIXES, *PAGE_SUFFIXES, *DICOM_SUFFIXES)  # formats for folders with one file per view
 SERIES_SUFFIXES = (".npy", *VIEW_SUFFIXES, *HDF5_SUFFIXES, *DESCRIPTION_SUFFIXES)
 
 
 class RawHeader(Config):
-    """How numbers lie in a file without a header.
+    """Layout of a raw file without a header.
 
     Attributes:
-        shape: (views, rows, cols); a flat or dark field of the same scan has as many views as fill its file.
-        type: of a number.
-        byte_order: of numbers of more than a byte.
-        skip_bytes: before the first.
+        shape: (views, rows, cols). For flat and dark fields, the number of images follows from the file size.
+        type: Data type.
+        byte_order: Byte order of multi-byte numbers.
+        skip_bytes: Number of bytes before the first number.
     """
 
     shape: tuple[int, int, int]
@@ -44,36 +44,40 @@ class RawHeader(Config):
     skip_bytes: int = Field(0, ge=0)
 
     def mapped(self, path: Path, *, views: bool = True) -> NDArray:
-        """The numbers (V, rows, cols) of a file, on the disk; `views` asks for as many as `shape` says.
+        """Memory-map the numbers (V, rows, cols) of a file.
+
+        Args:
+            path: The file.
+            views: Require the number of views in `shape`. If False, it follows from the file size.
 
         Raises:
-            ValueError: the file is smaller or larger than that.
+            ValueError: The file size does not fit.
         """
         kind = np.dtype(self.type).newbyteorder("<" if self.byte_order == "little" else ">")
         if min(self.shape) < 1:
             raise ValueError(f"raw.shape must be positive, got {self.shape}")
-        held, image = path.stat().st_size - self.skip_bytes, math.prod(self.shape[1:]) * kind.itemsize
-        number = self.shape[0] if views else max(held // image, 1)
-        if held != number * image:
+        num_bytes, image = path.stat().st_size - self.skip_bytes, math.prod(self.shape[1:]) * kind.itemsize
+        number = self.shape[0] if views else max(num_bytes // image, 1)
+        if num_bytes != number * image:
             raise ValueError(
-                f"{path.name} holds {held} bytes after the first {self.skip_bytes}, {number} images of "
+                f"{path.name} holds {num_bytes} bytes after the first {self.skip_bytes}, {number} images of "
                 f"{self.shape[1]} x {self.shape[2]} {self.type} are {number * image}"
             )
         return np.memmap(path, kind, "r", offset=self.skip_bytes, shape=(number, *self.shape[1:]))
 
 
 class ScanDescription(Config):
-    """What a description may say; places are relative to its folder, and within it.
+    """Contents of a scan description. Paths are relative to its folder and must lie within it.
 
     Attributes:
-        images: file or folder of the views.
-        flat: file or folder of images of the open beam, of which the mean is taken.
-        dark: file or folder of images without a beam, of which the mean is taken, off views and open beam alike.
-        open_beam: one number in place of `flat`; without both, images are line integrals.
-        saturation: the detector's ceiling.
-        line_integrals: whether images are line integrals; without it, what an open beam says.
-        dataset: name within HDF5 files.
-        raw: how numbers lie in files without a header.
+        images: File or folder of the views.
+        flat: File or folder of open-beam images; their mean is used.
+        dark: File or folder of images without a beam; their mean is subtracted from views and open beam.
+        open_beam: One number instead of `flat`. Without `flat` and `open_beam`, images are line integrals.
+        saturation: Saturation level of the detector.
+        line_integrals: True if images are line integrals. By default, they are if there is no open beam.
+        dataset: Name of the dataset within HDF5 files.
+        raw: Layout of files without a header.
     """
 
     images: Path
@@ -87,39 +91,41 @@ class ScanDescription(Config):
 
 
 def read_description(path: Path) -> ScanDescription:
-    """A scan's description, whose places exist.
+    """Read a scan description and check that its files exist.
 
     Raises:
-        FileNotFoundError: a place that it names is missing.
-        ValueError: unknown keys, wrong values, or a place outside its folder.
+        FileNotFoundError: A file or folder that it names is missing.
+        ValueError: Unknown keys, invalid values, or a path outside its folder.
     """
-    said = ScanDescription.of(read_config(path), f"scan description {path}")
-    if said.flat is not None and said.open_beam is not None:
-        raise ValueError("flat and open_beam both say how strong the open beam is: name one")
-    if said.line_integrals and (said.flat is not None or said.dark is not None or said.open_beam is not None):
+    scan = ScanDescription.of(read_config(path), f"scan description {path}")
+    if scan.flat is not None and scan.open_beam is not None:
+        raise ValueError("flat and open_beam both define the open beam: name one")
+    if scan.line_integrals and (scan.flat is not None or scan.dark is not None or scan.open_beam is not None):
         raise ValueError("line integrals need no flat, dark or open_beam")
-    if said.dark is not None and said.flat is None and said.open_beam is None:
+    if scan.dark is not None and scan.flat is None and scan.open_beam is None:
         raise ValueError("a dark field alone leaves the open beam unknown: name flat or open_beam")
-    places = {name: place for name in ("images", "flat", "dark") if (place := getattr(said, name)) is not None}
-    return said.model_copy(update={name: _place(path, place) for name, place in places.items()})
+    places = {name: place for name in ("images", "flat", "dark") if (place := getattr(scan, name)) is not None}
+    return scan.model_copy(update={name: _place(path, place) for name, place in places.items()})
 
 
 def _place(path: Path, name: Path) -> Path:
-    """A place that a description at a path names."""
+    """The path of a file or folder named in the description at `path`."""
     folder, place = path.parent, path.parent / name
     if not place.resolve().is_relative_to(folder.resolve()):
-        raise ValueError(f"{name} lies outside the description's folder: places are named from there, within it")
+        raise ValueError(
+            f"{name} lies outside the description's folder: paths are relative to it and must lie within it"
+        )
     if not place.exists():
         raise FileNotFoundError(f"{name}, which scan description {path} names, does not exist")
     return place
 
 
 def open_series(path: Path) -> ImageSeries:
-    """The images of a file (see `SERIES_SUFFIXES`), or of a folder with one file a view, in the order of their numbers.
+    """Open the images of a file (see `SERIES_SUFFIXES`), or of a folder with one file per view, sorted by number.
 
     Raises:
-        ValueError: no such kind of file, damaged, or a folder whose files do not belong together.
-        FileNotFoundError: a file that a description names is missing.
+        ValueError: The format is unknown, a file is damaged, or the files of a folder do not belong together.
+        FileNotFoundError: A file that a description names is missing.
     """
     if path.is_dir():
         return _of_folder(path)
@@ -137,7 +143,7 @@ def open_series(path: Path) -> ImageSeries:
 
 
 def _of_images(path: Path) -> ImageSeries:
-    """One file of images of the common kinds."""
+    """The images of a single image file (TIFF, PNG, DICOM, ITK formats)."""
     suffix = path.suffix.lower()
     if suffix in PAGE_SUFFIXES:
         return ImageSeries(num_pages(path), lambda views: read_pages(path, views))
@@ -157,10 +163,10 @@ def _of_array(array: NDArray) -> ImageSeries:
 def _of_folder(folder: Path) -> ImageSeries:
     files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
     kinds = {file: kind for file in files if (kind := _kind(file)) is not None}
-    if len(found := sorted(set(kinds.values()))) != 1:
-        what = f"files of several kinds ({', '.join(found)})" if found else "no images"
-        raise ValueError(f"a folder of projections holds one image file a view, this one {what}")
-    if found == ["DICOM"]:
+    if len(formats := sorted(set(kinds.values()))) != 1:
+        what = f"files of several kinds ({', '.join(formats)})" if formats else "no images"
+        raise ValueError(f"a folder of projections holds one image file a view, this one holds {what}")
+    if formats == ["DICOM"]:
         views = dicom_files(folder)
     else:
         views = sorted(kinds, key=by_number)
@@ -174,16 +180,16 @@ def _of_folder(folder: Path) -> ImageSeries:
 
 
 def _kind(file: Path) -> str | None:
-    """Of an image file; None for one that is something else."""
+    """Format of an image file; None if it is no known image file."""
     if is_dicom(file):
         return "DICOM"
     name = file.name.lower()
-    same = {".tiff": ".tif", ".nii.gz": ".nii"}
-    return next((same.get(kind, kind) for kind in (*STACK_SUFFIXES, *PAGE_SUFFIXES) if name.endswith(kind)), None)
+    aliases = {".tiff": ".tif", ".nii.gz": ".nii"}
+    return next((aliases.get(kind, kind) for kind in (*STACK_SUFFIXES, *PAGE_SUFFIXES) if name.endswith(kind)), None)
 
 
 def _single(file: Path) -> tuple[NDArray, ImageHeader | None]:
-    """The one image (rows, cols) of a file, and its header."""
+    """The single image (rows, cols) of a file, and its header."""
     try:
         series = _of_images(file)
         if series.num_views != 1:
@@ -202,23 +208,23 @@ def _alike(file: Path, first: NDArray) -> NDArray:
 
 
 def _check_numbers(files: list[Path]) -> None:
-    """Warns where the views' numbers, the last of each name, leave some out."""
-    found = [re.findall(r"\d+", file.name.split(".")[0]) for file in files]
-    if len(files) < 3 or not all(found):
+    """Warn if the view numbers (the last number in each file name) have a gap."""
+    digit_groups = [re.findall(r"\d+", file.name.split(".")[0]) for file in files]
+    if len(files) < 3 or not all(digit_groups):
         return
-    numbers = sorted(int(digits[-1]) for digits in found)
+    numbers = sorted(int(digits[-1]) for digits in digit_groups)
     steps = np.diff(numbers)
     if (steps > np.median(steps)).any() and (steps > 0).all():
-        at = int(np.argmax(steps > np.median(steps)))
+        gap = int(np.argmax(steps > np.median(steps)))
         warnings.warn(
-            f"folder {files[0].parent}: images are numbered {numbers[at]} and then {numbers[at + 1]}: "
+            f"folder {files[0].parent}: images are numbered {numbers[gap]} and then {numbers[gap + 1]}: "
             "is a view missing?",
             stacklevel=4,
         )
 
 
 def _described(path: Path) -> ImageSeries:
-    """Images, flat and dark fields as a description says."""
+    """The images, flat and dark fields of a scan description."""
     scan = read_description(path)
     series = _opened(scan, scan.images)
     size = series.read([0]).shape[1:]
@@ -252,13 +258,13 @@ def _opened(scan: ScanDescription, place: Path) -> ImageSeries:
 
 
 def _is_raw(file: Path) -> bool:
-    """Whether a file has no header that is known."""
+    """True if a file has no known format and is read as raw data."""
     name = file.name.lower()
     return file.is_file() and not name.startswith(".") and not name.endswith(SERIES_SUFFIXES) and not is_dicom(file)
 
 
 def _of_raw(raw: RawHeader, place: Path, files: list[Path], *, views: bool) -> ImageSeries:
-    """Files without a header, one after the other; views are as many as the header says."""
+    """The images of raw files, concatenated. If `views`, their number must be that of `raw.shape`."""
     parts = [raw.mapped(file, views=views and len(files) == 1) for file in files]
     images = [image for part in parts for image in part]
     if views and len(images) != raw.shape[0]:

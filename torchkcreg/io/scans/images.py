@@ -1,4 +1,4 @@
-"""Image files through ITK, their sizes checked against their files before anything is allocated."""
+"""Reading of image files with ITK or Pillow. Sizes in headers are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -16,43 +16,47 @@ from numpy.typing import NDArray
 from PIL import Image
 
 PAGE_SUFFIXES = (".tif", ".tiff", ".png")
-_SAMPLE_FORMAT, _BITS, _PHOTOMETRIC = 339, 258, 262  # tags
+_SAMPLE_FORMAT, _BITS, _PHOTOMETRIC = 339, 258, 262  # TIFF tags
 _UNSIGNED = 1
 _GREY = ("L", "I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 META_SUFFIXES = (".mha", ".mhd")
-_LONGEST = 1 << 16  # bytes of a header
+_LONGEST = 1 << 16  # largest header in bytes
 _FLAGS = ("BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB", "CompressedData")
-_MOST_PACKED = 5000  # how many times larger than its file an image can be: deflate and LZW pack less
-_SMALLEST = 1 << 16  # bytes: what is not worth the question
+_MOST_PACKED = 5000  # upper limit of the compression ratio; deflate and LZW reach less
+_SMALLEST = 1 << 16  # bytes; smaller sizes are not checked
 _DETACHED = (".mhd", ".nhdr")  # headers whose data are in another file
 
 
 def num_pages(path: Path) -> int:
-    """How many pages a file has; raises as `read_pages`."""
+    """Number of pages of a file. Raises the same errors as `read_pages`."""
     with _opened(path) as file:
         return int(getattr(file, "n_frames", 1))
 
 
 def read_pages(path: Path, pages: Sequence[int]) -> NDArray:
-    """Pages (N, rows, cols) of a file, in this order.
+    """Read pages (N, rows, cols) of a TIFF or PNG file, in the given order.
 
     Raises:
-        ValueError: damaged, in colours, of numbers that Pillow has none for (64 bits), or pages differ.
+        ValueError: The file is damaged, in colour, has a data type that Pillow lacks (64 bits), or pages differ.
     """
-    found = []
+    images = []
     with _opened(path) as file:
         for page in pages:
             file.seek(page)
             if file.mode not in _GREY:
                 raise ValueError(f"page {page} is of kind {file.mode}, not grey numbers of up to 32 bits")
-            found.append(_numbers(file, page))
-    if len({(image.shape, image.dtype) for image in found}) > 1:
+            images.append(_numbers(file, page))
+    if len({(image.shape, image.dtype) for image in images}) > 1:
         raise ValueError("its pages are of different sizes or kinds")
-    return np.stack(found)
+    return np.stack(images)
 
 
 def _numbers(file: Image.Image, page: int) -> NDArray:
-    """A page as it is stored: Pillow takes unsigned numbers of 32 bits for signed ones, and turns others over."""
+    """The stored numbers of a page.
+
+    Pillow reads unsigned 32-bit numbers as signed; this is undone. Pages in which white is zero and signed 8-bit pages
+    are rejected, because Pillow changes their values.
+    """
     tags = getattr(file, "tag_v2", {})
     sample, bits = (tags.get(tag, (default,)) for tag, default in ((_SAMPLE_FORMAT, _UNSIGNED), (_BITS, 8)))
     kind = sample[0] if isinstance(sample, tuple) else sample
@@ -75,14 +79,17 @@ def _opened(path: Path) -> Iterator[Image.Image]:
                 yield file
     except ValueError:
         raise
-    except Exception as error:  # Pillow's and its decoders' own
+    except Exception as error:  # Pillow and its decoders raise various types
         raise ValueError(f"is no image that can be read: {(str(error).splitlines() or ['damaged'])[0]}") from error
 
 
 def check_meta_header(path: Path) -> None:
-    """Nothing; RuntimeError where a header is not as its format has it.
+    """Check that a MetaImage header is valid.
 
-    A wrong flag makes ITK read binary data as text and write beyond its memory.
+    An invalid flag makes ITK read binary data as text and write out of bounds.
+
+    Raises:
+        RuntimeError: The header is not valid.
     """
     with path.open("rb") as file:
         start = file.read(_LONGEST)
@@ -109,11 +116,11 @@ def check_meta_header(path: Path) -> None:
 
 
 def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
-    """Slices of a volume, in this order, without reading the others where the format allows: uncompressed ones.
+    """Read slices of a volume in the given order. Other slices of uncompressed files are not read if the format allows.
 
     Raises:
-        RuntimeError: It cannot be read, or its header asks for more than the file can hold.
-        ValueError: It holds more than one number a pixel.
+        RuntimeError: The file cannot be read, or its header claims more data than the file can hold.
+        ValueError: The file has more than one number per pixel, or is no stack of two-dimensional images.
     """
     reader = opened(path)
     if reader.GetNumberOfComponents() != 1:
@@ -123,21 +130,21 @@ def read_slices(path: Path, slices: Sequence[int]) -> NDArray:
         raise ValueError(f"it has {len(reader.GetSize())} dimensions of {reader.GetSize()}: a stack of views has three")
     if list(slices) == list(range(number)):
         return sitk.GetArrayFromImage(reader.Execute()).reshape(number, rows, cols)
-    found = []
+    images = []
     for index in slices:
         reader.SetExtractIndex([0, 0, index])
         reader.SetExtractSize([cols, rows, 1])
-        found.append(sitk.GetArrayFromImage(reader.Execute())[0])
-    return np.stack(found)
+        images.append(sitk.GetArrayFromImage(reader.Execute())[0])
+    return np.stack(images)
 
 
 @dataclass(frozen=True)
 class PixelHeader:
-    """Where the pixels of a stack of images are, by its header.
+    """Size, spacing and origin of the pixels of an image stack, from its header.
 
     Attributes:
         shape: (rows, cols).
-        pixel_spacing: (dv, du), mm; None for 1 x 1, which headers say that say nothing.
+        pixel_spacing: (dv, du), mm. None for 1 x 1 mm, a common default of image writers that is treated as missing.
         origin_mm: (u, v) of the centre of pixel (0, 0).
     """
 
@@ -147,10 +154,10 @@ class PixelHeader:
 
 
 def image_header(path: Path) -> PixelHeader | None:
-    """The header of a stack of images; None for what is no image, or has none.
+    """The header of an image stack; None if the format is none with such a header (MHA, MHD, NRRD, NHDR, NII).
 
     Raises:
-        ValueError: it cannot be read.
+        ValueError: The file cannot be read.
     """
     if path.suffix.lower() not in (".mha", ".mhd", ".nrrd", ".nhdr", ".nii"):
         return None
@@ -164,18 +171,22 @@ def image_header(path: Path) -> PixelHeader | None:
 
 
 def read_image(path: Path) -> sitk.Image:
-    """The image of a file; raises as `read_slices`."""
+    """Read the image of a file. Raises the same errors as `read_slices`."""
     return opened(path).Execute()
 
 
 def opened(path: Path) -> sitk.ImageFileReader:
-    """A reader that has read the header, and believes it; raises as `read_slices`."""
+    """An ITK reader that has read and checked the header of a file.
+
+    Raises:
+        RuntimeError: The file cannot be read, or its header claims more data than the file can hold.
+    """
     if path.suffix.lower() in META_SUFFIXES:
         check_meta_header(path)
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     reader.ReadImageInformation()
-    needed = math.prod(reader.GetSize()) * reader.GetNumberOfComponents()  # of a byte or more each
+    needed = math.prod(reader.GetSize()) * reader.GetNumberOfComponents()  # each takes at least one byte
     file = path.stat().st_size
     if not _is_detached(path) and not can_hold(file, needed):
         raise RuntimeError(f"its header asks for {needed} values, more than a file of {file} bytes can hold")
@@ -183,12 +194,12 @@ def opened(path: Path) -> sitk.ImageFileReader:
 
 
 def can_hold(file: int, needed: int) -> bool:
-    """Whether a file of so many bytes can unpack to as many as are needed."""
+    """True if a file of `file` bytes can decompress to `needed` bytes."""
     return needed <= max(_SMALLEST, _MOST_PACKED * file)
 
 
 def _is_detached(path: Path) -> bool:
-    """Whether a header's data are in another file, so that its own size says nothing."""
+    """True if the image data are in another file than the header, so the file size gives no limit."""
     if path.suffix.lower() in _DETACHED:
         return True
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""Projections as line integrals with a mask of the pixels that hold a measurement."""
+"""Projections as line integrals with a mask of valid pixels, and the conversion from intensities."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
 from .plausible import ImageHeader, stuck_pixels
 
 RELATIVE_FLOOR = 1e-6
-MOSTLY = 0.5  # of the pixels an open beam must light
+MOSTLY = 0.5  # minimum fraction of pixels with an open beam above the dark field
 DETECTOR_CEILINGS = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 16))
 
 
 @dataclass(frozen=True)
 class Projections:
-    """Line integrals -ln(I / I0) and the pixels where they mean something.
+    """Line integrals -ln(I / I0) with a mask of valid pixels.
 
     Attributes:
-        line_integrals: float32 (V, rows, cols), finite everywhere (masked pixels hold a stand-in).
-        mask: bool (V, rows, cols), True where a pixel counts.
-        num_masked: how many pixels do not count, by reason: "not finite", "not positive" (intensities at or below
-            zero, or the dark field), "in the file's mask", "without open beam", "stuck at the ceiling". Reasons that
-            never occurred are left out.
-        num_saturated: pixels at the detector's ceiling; they count (see `read_projections`).
-        header: what the file says of pixels and axes; None where it says nothing.
+        line_integrals: float32 (V, rows, cols), finite everywhere (masked pixels hold a placeholder).
+        mask: bool (V, rows, cols), True where a pixel is valid.
+        num_masked: Number of masked pixels by reason: "not finite", "not positive" (intensities at or below zero, or
+            the dark field), "in the file's mask", "without open beam", "stuck at the ceiling". Reasons without pixels
+            are omitted.
+        num_saturated: Number of pixels at the detector's saturation level; they are valid (see `read_projections`).
+        header: Pixel spacing and axes from the file; None if it gives none.
     """
 
     line_integrals: Tensor
@@ -41,27 +41,30 @@ class Projections:
     header: ImageHeader | None = None
 
     def select(self, views: Sequence[int]) -> Projections:
-        """The given views alone, in the given order; the counts stay those of the whole."""
+        """Select views in the given order. The counts still refer to all views."""
         check_views(views, len(self.line_integrals))
         index = list(views)
         return replace(self, line_integrals=self.line_integrals[index], mask=self.mask[index])
 
     def masked_note(self) -> str | None:
-        """How many pixels do not count, and why, in words; None where all do."""
+        """Text with the number of masked pixels and the reasons; None if no pixel is masked."""
         if not self.num_masked:
             return None
         reasons = ", ".join(f"{count} {reason}" for reason, count in self.num_masked.items())
         return f"{sum(self.num_masked.values())} pixels are masked ({reasons})"
 
     def check_against(self, geometry: ConeBeamGeometry) -> None:
-        """Nothing; ValueError when the geometry has another number of views or another detector.
+        """Check that views and detector fit a geometry.
 
-        A header whose pixels or axes contradict the geometry gives a warning.
+        Warns if pixel spacing or axes in the header contradict the geometry.
+
+        Raises:
+            ValueError: The number of views, rows or columns differs.
         """
-        have = tuple(self.line_integrals.shape)
-        want = (geometry.num_views, *(int(n) for n in geometry.det_shape))
-        if have != want:
-            raise ValueError(f"projections have (views, rows, cols) = {have}, the geometry has {want}")
+        shape = tuple(self.line_integrals.shape)
+        expected = (geometry.num_views, *(int(n) for n in geometry.det_shape))
+        if shape != expected:
+            raise ValueError(f"projections have (views, rows, cols) = {shape}, the geometry has {expected}")
         if self.header is not None:
             self.header.check_against(geometry)
 
@@ -69,7 +72,7 @@ class Projections:
 def converted(
     arrays: dict[str, NDArray], open_beam: ArrayLike | None, saturation: float | None, views: Sequence[int] | None
 ) -> Projections:
-    """What a file's arrays hold, by their names; an "image" is intensity where there is an open beam."""
+    """Convert the named arrays of a file to projections. An "image" is an intensity if there is an open beam."""
     beam = arrays.get("open_beam") if open_beam is None else np.asarray(open_beam)
     if "image" in arrays:
         arrays["line_integrals" if beam is None else "intensity"] = arrays.pop("image")
@@ -79,10 +82,12 @@ def converted(
     image = arrays[kind]
     if image.ndim != 3 or 0 in image.shape or image.dtype.kind not in "uif":
         raise ValueError(f"{kind} must be numbers of shape (V, rows, cols), got {image.dtype} {image.shape}")
-    kept = arrays.get("mask", np.broadcast_to(True, image.shape))
-    if kept.shape != image.shape or kept.dtype.kind not in "buif":
-        raise ValueError(f"mask must be numbers of the shape {image.shape} of {kind}, got {kept.dtype} {kept.shape}")
-    mask = kept != 0
+    given_mask = arrays.get("mask", np.broadcast_to(True, image.shape))
+    if given_mask.shape != image.shape or given_mask.dtype.kind not in "buif":
+        raise ValueError(
+            f"mask must be numbers of the shape {image.shape} of {kind}, got {given_mask.dtype} {given_mask.shape}"
+        )
+    mask = given_mask != 0
     beam = None if beam is None else _open_beam(beam, image.shape)
     if views is not None:
         check_views(views, len(image))
@@ -95,17 +100,17 @@ def converted(
         raise ValueError("has intensity but no open_beam, the intensity without an object: give it")
     dark = _dark(arrays["dark"], image.shape[1:]) if "dark" in arrays else np.zeros((1, 1, 1))
     if saturation is None and "saturation" in arrays:
-        said = arrays["saturation"]
-        if said.size != 1 or said.dtype.kind not in "uif":
-            raise ValueError(f"saturation must be one number, got {said.dtype} {said.shape}")
-        saturation = float(said.reshape(()))
+        level = arrays["saturation"]
+        if level.size != 1 or level.dtype.kind not in "uif":
+            raise ValueError(f"saturation must be one number, got {level.dtype} {level.shape}")
+        saturation = float(level.reshape(()))
     return _from_intensity(image, mask, beam, dark, saturation)
 
 
 def _from_line_integrals(image: NDArray, mask: NDArray) -> Projections:
     if image.dtype.kind in "ui":
         raise ValueError(f"{image.dtype} values look like intensities, not line integrals: give their open_beam")
-    finite = np.abs(image) < np.finfo(np.float32).max  # which NaN is not either
+    finite = np.abs(image) < np.finfo(np.float32).max  # False for NaN too
     values = torch.from_numpy(np.where(finite, image, 0).astype(np.float32))
     return Projections(values, torch.from_numpy(finite & mask), _counts(finite, finite, mask))
 
@@ -150,7 +155,7 @@ def _counts(finite: NDArray, positive: NDArray, mask: NDArray) -> dict[str, int]
 
 
 def _open_beam(beam: NDArray, shape: tuple[int, ...]) -> NDArray:
-    """The open beam with three dimensions that broadcast to `shape`."""
+    """The open beam as a three-dimensional array that broadcasts to `shape`."""
     if beam.dtype.kind not in "uif" or not np.isfinite(beam).all() or beam.size == 0 or beam.max() <= 0:
         raise ValueError(f"open_beam must be positive and finite, got {np.array2string(beam, threshold=4)}")
     if beam.ndim == 1 and len(beam) == shape[0]:
@@ -174,7 +179,11 @@ def _dark(dark: NDArray, shape: tuple[int, ...]) -> NDArray:
 
 
 def check_views(views: Sequence[int], num_views: int) -> None:
-    """Nothing; ValueError where there are no views, or one that does not exist."""
+    """Check view numbers.
+
+    Raises:
+        ValueError: There are no views, or one does not exist.
+    """
     if len(views) == 0:
         raise ValueError("views must name at least one view")
     for view in views:

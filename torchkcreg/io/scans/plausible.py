@@ -1,4 +1,4 @@
-"""Whether images can be what they are said to be: stuck pixels, raw counts, repeated views, headers that contradict."""
+"""Plausibility checks: stuck pixels, raw counts, duplicate views, header against geometry, magnification."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
 
-_RAW = 20.0  # a median line integral of this much lets a billionth of the beam through
-_BRIGHT = -0.7  # a median line integral below this: twice the open beam, more than scatter adds
+_RAW = 20.0  # median line integral; at this value a billionth of the beam is transmitted
+_BRIGHT = -0.7  # median line integral; below it pixels have twice the open beam, more than scatter adds
 _MAGNIFICATION = (1.0, 8.0)
-_ALONE = 0.7  # of the ceiling, which the neighbours of a stuck pixel stay below
+_ALONE = 0.7  # the neighbours of a stuck pixel stay below this fraction of the saturation level
 _SPACING = 0.01  # relative
 
 
 def implausible_images(line_integrals: Tensor, mask: Tensor) -> list[str]:
-    """What is doubtful about line integrals (V, rows, cols), a line each.
+    """Doubts about line integrals (V, rows, cols), one text each.
 
     Raises:
-        ValueError: They are certainly something else.
+        ValueError: The values are certainly no line integrals, but intensities.
     """
     values = line_integrals[mask]
     if len(values) == 0:
@@ -44,9 +44,10 @@ def implausible_images(line_integrals: Tensor, mask: Tensor) -> list[str]:
 
 
 def stuck_pixels(image: NDArray, saturated: NDArray[np.bool_], ceiling: float) -> NDArray[np.bool_]:
-    """Pixels (V, rows, cols) that stand at the ceiling by themselves in every view: the detector's fault.
+    """Defective detector pixels (V, rows, cols): isolated pixels at the saturation level in every view.
 
-    A region of open beam is wide, or moves from view to view; a single view cannot tell.
+    Saturated open-beam regions, in contrast, are wide or move from view to view. With a single view, the two cannot be
+    distinguished and no pixel is returned.
     """
     always = saturated.all(0)
     thin = always & ~binary_opening(always, np.ones((3, 3)))
@@ -58,11 +59,11 @@ def stuck_pixels(image: NDArray, saturated: NDArray[np.bool_], ceiling: float) -
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file says of its pixels.
+    """Pixel spacing and axes from the header of an image file.
 
     Attributes:
         spacing: (dv, du) in mm.
-        turned: Whether its axes run other than from the first pixel on.
+        turned: True if the direction matrix is not the identity.
     """
 
     spacing: tuple[float, float]
@@ -70,27 +71,31 @@ class ImageHeader:
 
     @classmethod
     def of(cls, image: sitk.Image | sitk.ImageFileReader) -> ImageHeader | None:
-        """The header of a stack of views, or of a reader that has read it; None for the default, which says nothing."""
+        """The header of an image stack or of its reader; None for the default of 1 x 1 mm and unrotated axes."""
         du, dv = image.GetSpacing()[:2]
         size = image.GetDimension()
         turned = not np.allclose(np.reshape(image.GetDirection(), (size, size)), np.eye(size), atol=1e-3)
         return None if du == dv == 1.0 and not turned else cls((dv, du), turned)
 
     def check_against(self, geometry: ConeBeamGeometry) -> None:
-        """Nothing; warns where a geometry has other pixels, or axes that may run the other way."""
+        """Warn if the pixel spacing differs from the geometry's, or if the axes are rotated or flipped."""
         expected = geometry.pixel_spacing
         if self.spacing != (1.0, 1.0) and not np.allclose(self.spacing, expected, rtol=_SPACING):
-            said, want = (" x ".join(f"{d:.4g}" for d in spacing) for spacing in (self.spacing, expected))
-            warnings.warn(f"the images' header says pixels of {said} mm, the geometry {want} mm", stacklevel=3)
+            spacing_text, expected_text = (
+                " x ".join(f"{d:.4g}" for d in spacing) for spacing in (self.spacing, expected)
+            )
+            warnings.warn(
+                f"the images' header says pixels of {spacing_text} mm, the geometry {expected_text} mm", stacklevel=3
+            )
         if self.turned:
             warnings.warn(
-                "the images' header turns their axes; pixels are taken as they are stored, row 0 with the smallest v",
+                "the images' header turns their axes; pixels are used as stored, row 0 with the smallest v",
                 stacklevel=3,
             )
 
 
 def implausible_magnification(geometry: ConeBeamGeometry, points: Tensor) -> str | None:
-    """What is doubtful about where an object (N, 3) stands between source and detector; None if nothing is."""
+    """Doubt about the position of an object (N, 3) between source and detector, as text; None if it is plausible."""
     depth = geometry.project(points.double())[1].median(-1).values
     ratios = geometry.detector_distances / depth
     least, most = int(ratios.argmin()), int(ratios.argmax())

@@ -1,4 +1,4 @@
-"""Files of projections."""
+"""Reading and writing of projection files."""
 
 from __future__ import annotations
 
@@ -26,24 +26,25 @@ _ARRAYS = ("intensity", "open_beam", "line_integrals", "mask", "saturation", "da
 
 
 class ProjectionFile:
-    """A file of projections of which some views are read at a time; `len` says how many there are.
+    """A projection file whose views are read on demand; `len` is the number of views.
 
-    Files: all that `read_projections` reads but `.npz`; compressed stacks are unpacked as a whole each time. A
-    detector's ceiling, and pixels that are stuck there, are told from the views that are read together.
+    All formats of `read_projections` except `.npz` are supported. Compressed stacks are decompressed as a whole at each
+    read. The detector's saturation level and stuck pixels are determined from the views that are read together.
 
     Args:
         path: The file.
-        open_beam: Intensity of the unattenuated beam, one number or one image; line integrals if None.
+        open_beam: Intensity of the unattenuated beam: one number, one image, or one of these per view. If None, the
+            file's open beam is used; without any, the values are line integrals.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it cannot be read, or is an `.npz`, which can only be read as a whole.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file cannot be read, or is an `.npz`, which can only be read as a whole.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, open_beam: ArrayLike | None = None) -> None:
         self.path, self.open_beam = existing_place(path, "projections"), open_beam
         if self.path.suffix.lower() == ".npz":
-            raise self._error(ValueError("views are read one by one from all kinds but .npz: write it as another"))
+            raise self._error(ValueError("single views cannot be read from an .npz: use another format"))
         try:
             self._series = open_series(self.path)
         except (ValueError, RuntimeError, OSError, TypeError) as error:
@@ -53,10 +54,10 @@ class ProjectionFile:
         return self._series.num_views
 
     def read(self, views: Sequence[int]) -> Projections:
-        """Some views, in this order, as `read_projections` gives them.
+        """Read views in the given order, as `read_projections` does.
 
         Raises:
-            ValueError: If there is no such view, or what it holds is no image.
+            ValueError: A view does not exist or is no image.
         """
         try:
             check_views(views, len(self))
@@ -65,7 +66,7 @@ class ProjectionFile:
             raise self._error(error) from error
 
     def _beam(self, views: Sequence[int]) -> ArrayLike | None:
-        """The open beam of some views, where it is told for each."""
+        """The open beam of the given views, if it is given per view; else the common one."""
         beam = None if self.open_beam is None else np.asarray(self.open_beam)
         return beam[list(views)] if beam is not None and beam.ndim in (1, 3) and len(beam) == len(self) else beam
 
@@ -81,33 +82,38 @@ def read_projections(
     saturation: float | None = None,
     views: Sequence[int] | None = None,
 ) -> Projections:
-    """Projections of a file as line integrals, with a mask.
+    """Read projections as line integrals with a mask.
 
-    Files: `.npz` with `intensity` and `open_beam` (the intensity without an object), or with `line_integrals`, and
-    optionally `dark` (the intensity without a beam), `mask` (nonzero where a pixel counts) and `saturation`; HDF5, with
-    flat and dark fields as Data Exchange and NXtomo have them; a scan's description in YAML (`ScanDescription`), which
-    names files, raw data, flat and dark fields; `.npy`, the images that SimpleITK reads (`.mha`, `.nrrd`, `.nii`,
-    `.tif`, `.dcm`; the slices are the views, row 0 has the smallest v), and folders with one image a view, in the order
-    of the numbers in their names: line integrals, or intensities where `open_beam` is given.
+    Formats:
 
-    Not finite values and intensities at or below zero are masked, counted, and replaced by the smallest intensity that
-    is taken at its word, half a count of an integer image and a millionth of the open beam otherwise; not finite line
-    integrals by 0. A *saturated*
-    pixel says that its line integral is at most the ceiling's: it keeps that value and counts, because masking the
-    open beam would cut the outline of the limb out of every view; such pixels are flat and pull at nothing. Those that
-    stand alone at the ceiling in every view are the detector's, not the beam's: they are masked.
+    * `.npz` with `intensity` and `open_beam` (the intensity without an object), or with `line_integrals`; optionally
+      `dark` (the intensity without a beam), `mask` (nonzero where a pixel is valid) and `saturation`.
+    * HDF5, with flat and dark fields as in Data Exchange and NXtomo.
+    * A scan description in YAML (`ScanDescription`) that names images, raw data, flat and dark fields.
+    * `.npy`, image stacks (`.mha`, `.nrrd`, `.nii`, `.tif`, `.dcm`; the slices are the views, row 0 has the smallest
+      v), and folders with one image per view, sorted by the numbers in their names. These hold line integrals, or
+      intensities if `open_beam` is given.
+
+    Invalid pixels are masked and counted. Non-finite line integrals are replaced by 0. Non-finite intensities and
+    intensities at or below zero are replaced by the smallest accepted intensity: half a count for integer images, else
+    a millionth of the open beam.
+
+    The line integral of a *saturated* pixel is at most that of the saturation level. The pixel keeps this value and is
+    valid, because masking the open beam would remove the outline of the limb from every view. Saturated regions are
+    constant, so they exert no force in a registration. Isolated pixels that are saturated in every view are detector
+    defects and are masked.
 
     Args:
-        path: the file.
-        open_beam: intensity of the unattenuated beam, a number or an array that broadcasts to (V, rows, cols) or has
-            shape (V,); overrides the file's own.
-        saturation: the detector's ceiling. Without it the file's own, and without that the largest value of an
-            integer image if it is 2^b - 1 with b = 8, 10, 12, 14 or 16.
-        views: views to take, in this order; all of them if not given.
+        path: The file or folder.
+        open_beam: Intensity of the unattenuated beam: a number, or an array that broadcasts to (V, rows, cols) or has
+            shape (V,). It overrides the file's open beam.
+        saturation: Saturation level of the detector. Default: the level given in the file, else the largest value of
+            an integer image if that is 2^b - 1 with b = 8, 10, 12, 14 or 16.
+        views: Views to read, in this order. Default: all.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, has no views, lacks an open beam, or a requested view does not exist.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file cannot be read, has no views, lacks an open beam, or a requested view does not exist.
     """
     path = existing_place(path, "projections")
     try:
@@ -125,12 +131,12 @@ def read_projections(
 def write_stack(
     path: str | os.PathLike[str], line_integrals: Tensor, pixel_spacing: Sequence[float] | None = None
 ) -> None:
-    """Nothing; writes line integrals (V, rows, cols) as an image stack (MHA, NRRD, NIfTI), single precision.
+    """Write line integrals (V, rows, cols) as an image stack (MHA, NRRD, NIfTI) in single precision.
 
     Args:
-        path: the file.
-        line_integrals: NaN where a pixel does not count.
-        pixel_spacing: (dv, du) in mm, for the header; the origin is that of a centred detector, as RTK has it.
+        path: The file.
+        line_integrals: Line integrals, NaN where a pixel is masked.
+        pixel_spacing: (dv, du) in mm for the header. The origin is then that of a centred detector, as in RTK.
     """
     image = sitk.GetImageFromArray(line_integrals.detach().cpu().float().numpy())
     if pixel_spacing is not None:
@@ -142,7 +148,11 @@ def write_stack(
 
 
 def _check_room(path: Path) -> None:
-    """Nothing; ValueError where an archive unpacks to more than this machine's memory."""
+    """Check that the arrays of an archive fit into the machine's memory.
+
+    Raises:
+        ValueError: They do not.
+    """
     with zipfile.ZipFile(path) as archive:
         needed = sum(item.file_size for item in archive.infolist() if item.filename.removesuffix(".npy") in _ARRAYS)
     if needed > (memory := physical_memory()):
@@ -156,10 +166,10 @@ def write_projections(
     open_beam: ArrayLike | Tensor | None = None,
     line_integrals: ArrayLike | Tensor | None = None,
 ) -> None:
-    """Nothing; writes a compressed `.npz` that `read_projections` reads: intensity and open beam, or line integrals.
+    """Write intensity and open beam, or line integrals, as a compressed `.npz` for `read_projections`.
 
     Raises:
-        ValueError: neither or both kinds are given, or the name does not end in .npz.
+        ValueError: Neither or both kinds are given, or the name does not end in .npz.
     """
     if (intensity is None) == (line_integrals is None) or (intensity is None) != (open_beam is None):
         raise ValueError("write_projections takes intensity and open_beam, or line_integrals alone")
@@ -175,7 +185,7 @@ def _load(path: Path) -> tuple[dict[str, NDArray], ImageHeader | None]:
     try:
         if path.suffix.lower() == ".npz":
             loaded = np.load(path, allow_pickle=False)
-            if isinstance(loaded, np.ndarray):  # an array under an archive's name
+            if isinstance(loaded, np.ndarray):  # an NPY file with the suffix .npz
                 return {"image": loaded}, None
             with loaded as file:
                 _check_room(path)
@@ -184,6 +194,6 @@ def _load(path: Path) -> tuple[dict[str, NDArray], ImageHeader | None]:
         return series.arrays(range(series.num_views)), series.header
     except (FileNotFoundError, ImportError):
         raise
-    except Exception as error:  # NumPy, zip archives and ITK's readers fail in many ways, and each means a damaged file
+    except Exception as error:  # NumPy, zipfile and ITK raise various types on a damaged file
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         raise ValueError(f"cannot be read: {reason[0]}") from error

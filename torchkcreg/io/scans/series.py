@@ -1,4 +1,4 @@
-"""Images of views that stay where they are until they are read, and what is said beside them."""
+"""Image series: views that are read on demand, with open beam, dark field and header."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .plausible import ImageHeader
 
 
 def by_number(file: Path) -> list[tuple[int, str]]:
-    """What to sort by: view_2 before view_10.
+    """Sort key for file names with numbers: view_2 comes before view_10.
 
     >>> [path.name for path in sorted([Path("v10.tif"), Path("v2.tif")], key=by_number)]
     ['v2.tif', 'v10.tif']
@@ -24,14 +24,14 @@ def by_number(file: Path) -> list[tuple[int, str]]:
 
 @dataclass(frozen=True)
 class ImageSeries:
-    """Images of views that stay where they are until they are read.
+    """Images of views that are read on demand.
 
     Attributes:
-        num_views: how many there are.
-        read: images (v, rows, cols) of a list of views, as they are stored.
-        beside: what is said of them: "open_beam", "dark", each a number or an image (rows, cols), "saturation".
-        header: what the file says of pixels and axes; None where it says nothing.
-        lines: whether they are line integrals, where that is said; None where it is not.
+        num_views: Number of views.
+        read: Function that returns the stored images (v, rows, cols) of a list of views.
+        beside: Further data: "open_beam" and "dark", each a number or an image (rows, cols), and "saturation".
+        header: Pixel spacing and axes from the file; None if it gives none.
+        lines: True for line integrals, False for intensities, None if not stated.
     """
 
     num_views: int
@@ -41,12 +41,12 @@ class ImageSeries:
     lines: bool | None = None
 
     def arrays(self, views: Sequence[int]) -> dict[str, NDArray]:
-        """Images of the given views and what is said of them, by name; images of no stated kind are the "image"."""
+        """Images of the given views and the data in `beside`, by name. Images of unstated kind are named "image"."""
         kind = {None: "image", True: "line_integrals", False: "intensity"}[self.lines]
         return {kind: self.read(views), **self.beside}
 
     def mean(self, views: Sequence[int]) -> NDArray:
-        """The mean (rows, cols) of some of the images, float32; they are read one by one."""
+        """Mean image (rows, cols) of the given views, float32. The images are read one at a time."""
         total = self.read([views[0]])[0].astype(np.float64)
         for view in views[1:]:
             total += self.read([view])[0]

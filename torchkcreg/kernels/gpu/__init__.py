@@ -1,6 +1,6 @@
-"""Kernels for GPUs, written in Triton, and how they are told to torch's dispatcher.
+"""Kernels for GPUs, written in Triton, by the names of their operators.
 
-With ``TRITON_INTERPRET=1`` set before Triton is first imported they run, slowly, on CPU tensors.
+If `TRITON_INTERPRET=1` is set before Triton is first imported, they run, slowly, on CPU tensors.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""What materials let through of a beam of several energies, in Triton: a program takes a block of pixels.
+"""Transmission of a beam of several energies through materials, in Triton: one program per block of pixels.
 
-Blurs are `filtered`'s; averages over a pixel's sub-pixels are torch's.
+The blur is done by `filtered`, the average over sub-pixels by torch.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from torch.nn.functional import avg_pool2d
 
 from .filters import filtered
 
-_PIXELS = 256  # of a program
+_PIXELS = 256  # per program
 
 
 @triton.jit
 def _passed(lengths, attenuation, energy, pixel, there, image, pixels, views, energies, MATERIALS: tl.constexpr):
-    """Transmission at one energy behind all materials; image is the number of candidate and view."""
+    """Transmission at one energy behind all materials. `image` is candidate * views + view."""
     exponent = tl.zeros([pixel.shape[0]], dtype=lengths.dtype.element_ty)
     for m in tl.static_range(MATERIALS):
         at = lengths + ((image // views * MATERIALS + m) * views + image % views).to(tl.int64) * pixels
@@ -44,7 +44,7 @@ def _gradients(
     upstream, lengths, attenuation, weights, to_lengths, to_weights, moments, pixels, views, energies,
     MATERIALS: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of a block's path lengths; what it adds to those of weights, and sums of passed lengths by energy."""
+    """Gradients to the path lengths of a block, and its contributions to those of weights and attenuation."""
     image, pixel = tl.program_id(1), tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     there = pixel < pixels
     block = image * tl.num_programs(0) + tl.program_id(0)
@@ -77,7 +77,7 @@ def transmission_backward(
     pooling: int,
     need_attenuation: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients to path lengths, attenuation (empty where it is not needed), weights and blur kernels."""
+    """Gradients to path lengths, attenuation (empty if not needed), weights and blur kernels."""
     lengths, attenuation, weights = (t.contiguous() for t in (lengths, attenuation, weights))
     candidates, materials, views, rows, cols = lengths.shape
     spread = grad.repeat_interleave(pooling, -2).repeat_interleave(pooling, -1) / pooling**2
@@ -114,10 +114,10 @@ def _kernel_gradient(spread: Tensor, signal: Tensor, kernel: Tensor) -> Tensor:
     radius, (rows, cols) = kernel.shape[-1] // 2, signal.shape[-2:]
     shifts = torch.arange(-radius, radius + 1, device=kernel.device)
     only_rows, only_cols = filtered(signal, kernel, axes=(-2,)), filtered(spread, kernel, transposed=True, axes=(-1,))
-    found = []
+    gradients = []
     for shift in shifts.tolist():
         beside = (torch.arange(cols, device=kernel.device) + shift).clamp(0, cols - 1)
         above = (torch.arange(rows, device=kernel.device) + shift).clamp(0, rows - 1)
         second = (only_rows.index_select(-1, beside) * spread).sum((1, 2, 3))
-        found.append(second + (signal.index_select(-2, above) * only_cols).sum((1, 2, 3)))
-    return torch.stack(found, dim=-1)
+        gradients.append(second + (signal.index_select(-2, above) * only_cols).sum((1, 2, 3)))
+    return torch.stack(gradients, dim=-1)

@@ -1,4 +1,4 @@
-"""Separable filters in Triton: a program takes a block of pixels along one axis."""
+"""Separable filters in Triton: one program per block of pixels, one axis at a time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_PIXELS = 256  # of a program
+_PIXELS = 256  # per program
 
 
 @triton.jit
@@ -15,7 +15,7 @@ def _along(
     images, kernel, result, count, size, step, images_of_kernel, TAPS: tl.constexpr, TRANSPOSED: tl.constexpr,
     PIXELS: tl.constexpr,
 ):  # fmt: skip
-    """Filters along an axis of `size` pixels that lie `step` apart, the border repeated, or does the transpose."""
+    """Filter along an axis of `size` pixels, `step` elements apart, with the border repeated; or the transpose."""
     pixel = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     there = pixel < count
     i = (pixel // step) % size
@@ -31,7 +31,7 @@ def _along(
             use = there
         value = tl.load(images + pixel + (other - i) * step, mask=use, other=0.0)
         total += value * tl.load(taps + tap, mask=there, other=0.0)
-    if TRANSPOSED:  # what would go beyond an end goes to its last pixel
+    if TRANSPOSED:  # contributions beyond an end go to its last pixel
         for far in range(RADIUS):
             before = there & (i == 0) & (i + far < size)
             behind = there & (i == size - 1) & (i - far >= 0)
@@ -44,15 +44,15 @@ def _along(
 
 
 def filtered(images: Tensor, kernel: Tensor, *, transposed: bool = False, axes: tuple[int, ...] = (-2, -1)) -> Tensor:
-    """Images (B, ..., rows, cols) filtered along the last axes, or one of them, each of the B by its own kernel."""
+    """Images (B, ..., rows, cols) filtered along rows and columns, or one of them, with one kernel per element of B."""
     images, kernel = images.contiguous(), kernel.contiguous()
-    own = images[0].numel() if len(images) else 1
+    pixels_per_kernel = images[0].numel() if len(images) else 1
     for axis in axes:
         size, step = images.shape[axis], images.stride(axis)
         result = torch.empty_like(images)
         if images.numel():
             _along[(triton.cdiv(images.numel(), _PIXELS),)](
-                images, kernel, result, images.numel(), size, step, own,
+                images, kernel, result, images.numel(), size, step, pixels_per_kernel,
                 TAPS=kernel.shape[-1], TRANSPOSED=transposed, PIXELS=_PIXELS,
             )  # fmt: skip
         images = result

@@ -1,6 +1,6 @@
-"""The point-cloud DRR in Triton: a program takes a block of nodes in one view, or through all views backwards.
+"""Point-cloud DRR in Triton: one program per block of nodes and view (forward), or per block of nodes (backward).
 
-Images are summed by atomic additions, so that the last bits may differ from run to run; gradients are not.
+Images are summed by atomic additions, so their last bits may differ from run to run. Gradients are reproducible.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_NODES = 128  # of a program
+_NODES = 128  # per program
 _MIN_DEPTH = tl.constexpr(1e-3)  # mm, as in the reference
 
 
 @triton.jit
 def _seen(points, matrix, first, candidate, num_nodes, rows, cols, TAPS: tl.constexpr, NODES: tl.constexpr):
-    """Nodes of a block: index, world position, pixel position, inverse depth, and which of them reach the image."""
+    """Nodes of a block: index, world and pixel position, inverse depth, and mask of those that reach the image."""
     node = first + tl.arange(0, NODES)
     there = node < num_nodes
     at = points + (candidate * num_nodes + node) * 3
@@ -35,7 +35,7 @@ def _seen(points, matrix, first, candidate, num_nodes, rows, cols, TAPS: tl.cons
 
 @triton.jit
 def _phase(coordinate, TAPS: tl.constexpr, PHASES: tl.constexpr):
-    """First pixel that a node reaches, lower tabulated phase, and the weight of the upper one."""
+    """First pixel that a node reaches, lower tabulated phase, and weight of the upper phase."""
     below = tl.floor(coordinate)
     position = (coordinate - below) * PHASES
     phase = tl.minimum(position.to(tl.int32), PHASES - 1)
@@ -76,7 +76,7 @@ def _gather(
     num_nodes, num_views, num_blocks, block_size, rows, cols,
     TAPS: tl.constexpr, PHASES: tl.constexpr, NODES: tl.constexpr, MATRICES: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of a block's nodes, and what it adds to those of the matrices: (programs, V, 12)."""
+    """Gradients to a block's nodes, and its contributions (programs, V, 12) to those of the matrices."""
     candidate, first = tl.program_id(1), tl.program_id(0) * NODES
     line: tl.constexpr = (PHASES + 1) * TAPS * TAPS
     zero = tl.zeros([NODES], dtype=points.dtype.element_ty)
@@ -158,7 +158,7 @@ def point_drr_backward(
     need_volumes: bool,
     need_matrices: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients to points, volumes and matrices of a gradient to the images; those not needed come back empty."""
+    """Gradients to points, volumes and matrices from a gradient to the images; empty if not needed."""
     grad, points, volumes, matrices, table = (t.contiguous() for t in (grad, points, volumes, matrices, table))
     candidates, nodes, views = len(points), points.shape[1], len(matrices)
     blocks = triton.cdiv(nodes, _NODES)

@@ -1,4 +1,4 @@
-"""Cubic B-splines at scattered points in Triton: a program takes a block of points and one value of theirs."""
+"""Cubic B-splines at scattered points in Triton: one program per block of points and feature."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_POINTS = 128  # of a program
+_POINTS = 128  # per program
 
 
 @triton.jit
 def _piece(eta, number: tl.constexpr, ORDER: tl.constexpr):
-    """One of the four pieces of the B-spline on a knot interval, or its derivative; `bspline_pieces` in the package."""
+    """One of the four pieces of the B-spline on a knot interval, or its derivative; see `bspline_pieces`."""
     mirrored: tl.constexpr = number >= 2
     e = 1.0 - eta if mirrored else eta  # pieces 2 and 3 are pieces 1 and 0 of 1 - eta
     rest = 1.0 - e
     outer: tl.constexpr = number == 0 or number == 3
     sign: tl.constexpr = -1.0 if mirrored and ORDER % 2 == 1 else 1.0
     if ORDER == 0:
-        found = rest * rest * rest / 6.0 if outer else (3.0 * e - 6.0) * e * e / 6.0 + 2.0 / 3.0
+        value = rest * rest * rest / 6.0 if outer else (3.0 * e - 6.0) * e * e / 6.0 + 2.0 / 3.0
     elif ORDER == 1:
-        found = -rest * rest / 2.0 if outer else (1.5 * e - 2.0) * e
+        value = -rest * rest / 2.0 if outer else (1.5 * e - 2.0) * e
     elif ORDER == 2:
-        found = rest if outer else 3.0 * e - 2.0
+        value = rest if outer else 3.0 * e - 2.0
     elif ORDER == 3:
-        found = e * 0.0 - 1.0 if outer else e * 0.0 + 3.0
+        value = e * 0.0 - 1.0 if outer else e * 0.0 + 3.0
     else:
-        found = e * 0.0
-    return sign * found
+        value = e * 0.0
+    return sign * value
 
 
 @triton.jit

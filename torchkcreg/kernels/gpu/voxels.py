@@ -1,7 +1,7 @@
-"""Voxel projectors in Triton: a program takes a block of a view's pixels, or of voxels.
+"""Voxel projectors in Triton: one program per block of pixels of a view, or per block of voxels.
 
-Joseph's projector gathers; its adjoint spreads by atomic additions, so that the last bits may differ from run to run.
-Rays are laid out in double precision and followed in that of the data.
+Joseph's projector gathers. Its adjoint uses atomic additions, so its last bits may differ from run to run. Positions
+along rays are computed in double precision, sums in the precision of the data.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_PIXELS = 128  # of a program
+_PIXELS = 128  # per program
 _VOXELS = 256
-_BIAS_Y, _BIAS_Z = tl.constexpr(1.0 - 1e-6), tl.constexpr(1.0 - 2e-6)  # at 45 degrees rounding must not choose
+_BIAS_Y, _BIAS_Z = tl.constexpr(1.0 - 1e-6), tl.constexpr(1.0 - 2e-6)  # rounding must not decide at 45 degrees
 
 
 @triton.jit
@@ -20,7 +20,7 @@ def _walk(
     volume, images, rays, spacing, views, rows, cols, depth, height, width, planes,
     PIXELS: tl.constexpr, ADJOINT: tl.constexpr,
 ):  # fmt: skip
-    """Every plane of each ray's major axis: four voxels are read, or added to."""
+    """Walk along each ray's major axis plane by plane, and read, or add to, four voxels per plane."""
     batch, view = tl.program_id(1) // views, tl.program_id(1) % views
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     there = pixel < rows * cols
@@ -35,7 +35,7 @@ def _walk(
     wide, tall, deep = tl.abs(x), tl.abs(y) * _BIAS_Y, tl.abs(z) * _BIAS_Z
     along_x, along_z = (wide >= tall) & (wide >= deep), (deep > wide) & (deep > tall)
     along_y = (tall > wide) & (tall >= deep)
-    # of the major axis, and of the two others in the order of x, y, z
+    # values of the major axis, and of the two other axes in the order x, y, z
     major, first, second = (
         tl.where(along_x, x, tl.where(along_y, y, z)),
         tl.where(along_x, y, x),
@@ -78,7 +78,7 @@ def _walk(
 def _gather_views(
     images, matrices, volume, views, rows, cols, depth, height, width, VOXELS: tl.constexpr
 ):  # fmt: skip
-    """Sum over views of the image, bilinear, over the squared depth."""
+    """Sum over views of the bilinearly interpolated image divided by the squared depth."""
     batch, voxel = tl.program_id(1), tl.program_id(0).to(tl.int64) * VOXELS + tl.arange(0, VOXELS)
     there = voxel < depth.to(tl.int64) * height * width
     x, y, z = voxel % width, (voxel // width) % height, voxel // (width * height)
@@ -121,7 +121,7 @@ def voxel_project(volume: Tensor, rays: Tensor, spacing: Tensor, rows: int, cols
 def voxel_backproject(
     images: Tensor, rays: Tensor, spacing: Tensor, depth: int, height: int, width: int
 ) -> Tensor:  # fmt: skip
-    """The adjoint of `voxel_project`: images (B, V, rows, cols) into (B, D, H, W)."""
+    """Adjoint of `voxel_project`: images (B, V, rows, cols) to volumes (B, D, H, W)."""
     images, rays, spacing = images.contiguous(), rays.double().contiguous(), spacing.double().contiguous()
     volume = images.new_zeros(len(images), depth, height, width)
     if images.numel() and volume.numel():
@@ -134,7 +134,7 @@ def voxel_backproject(
 
 
 def voxel_backproject_weighted(images: Tensor, matrices: Tensor, depth: int, height: int, width: int) -> Tensor:
-    """Sum over views of the image over the squared depth, (B, D, H, W); see `voxel_weighted_reference`."""
+    """Sum over views of the image divided by the squared depth, (B, D, H, W); see `voxel_weighted_reference`."""
     images, matrices = images.contiguous(), matrices.double().contiguous()
     volume = images.new_zeros(len(images), depth, height, width)
     if images.numel() and volume.numel():

@@ -1,7 +1,8 @@
-"""An experiment on a desk, out of a file: a specimen, loads in newton, a scanner, and images with the truth about them.
+"""Simulated bench experiment from a recipe file: specimen, loads in newton, scanner, images and ground truth.
 
-Nothing that makes the images is the registration's: path lengths are exact chords of meshes and solids, scatter comes
-from kernels that depend on what they pass, blur from focal spot and scintillator, and bones are bodies.
+The image formation is independent of the registration's model: path lengths are exact chords of meshes and solids,
+scatter comes from kernels that depend on the object's thickness, blur from focal spot and scintillator, and bones are
+solid bodies.
 """
 
 from .acquisition import Acquisition, acquisitions, panel_of, views_of

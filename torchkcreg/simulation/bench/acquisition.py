@@ -1,4 +1,4 @@
-"""Images of a specimen under each of its loads, as a scanner takes them, with the truth about them."""
+"""Simulated images of a specimen under each of its loads, with the ground truth."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from .standing import parts_in_beam
 
 @dataclass(frozen=True, eq=False)
 class Acquisition:
-    """One configuration of an experiment.
+    """Images of one configuration of an experiment.
 
     Attributes:
-        name: Of the configuration.
-        loaded: Where everything is.
-        parts: What stands in the beam.
+        name: Name of the configuration.
+        loaded: Positions of implant, fragments and screws under the load.
+        parts: Bodies in the beam.
         counts: Images (V, rows, cols), uint16.
-        scatter_to_primary: What it is behind the object, mean over mean.
+        scatter_to_primary: Mean scatter over mean primary behind the object.
     """
 
     name: str
@@ -49,25 +49,28 @@ def acquisitions(
     construct: ElasticConstruct | None = None,
     kept: Collection[str] = (),
 ) -> Iterator[Acquisition]:
-    """Each configuration of a specimen's recipe in turn, imaged.
+    """Image the configurations of a specimen's recipe one after the other.
 
     Args:
-        specimen: Without load.
+        specimen: Specimen without load.
         geometry: The views.
-        spectrum: As detected.
-        progress: Show it.
-        construct: Of the specimen, where it has been made already: making it takes seconds.
-        kept: Names of configurations that are left out; the others are what they are with them.
+        spectrum: Detected spectrum.
+        progress: Show a progress bar.
+        construct: Elastic model of the specimen if it exists already: building it takes seconds.
+        kept: Names of configurations to skip. The images of the others do not depend on it.
+
+    Yields:
+        Acquisition: One for each configuration that is not skipped.
 
     Raises:
-        ValueError: If the parts do not fit into each other, or a load is impossible.
+        ValueError: If a part lies half inside the tissue, an insert reaches into a bone, or a load is impossible.
     """
     recipe = specimen.recipe
-    asked = [(i, name, load) for i, (name, load) in enumerate(recipe.configurations.items()) if name not in kept]
-    if construct is None and any(any(load.force) for _, _, load in asked):
+    jobs = [(i, name, load) for i, (name, load) in enumerate(recipe.configurations.items()) if name not in kept]
+    if construct is None and any(any(load.force) for _, _, load in jobs):
         construct = ElasticConstruct(specimen)
     panel, spacing = panel_of(recipe), geometry.pixel_spacing
-    for number, name, load in asked:
+    for number, name, load in jobs:
         state = loaded(specimen, load, construct)
         parts = parts_in_beam(specimen, state)
         primaries = _primaries(geometry, parts, spectrum, recipe.panel.supersample, name if progress else None)
@@ -82,7 +85,7 @@ def acquisitions(
 
 
 def _magnifications(geometry: ConeBeamGeometry, implant: trimesh.Trimesh) -> list[float]:
-    """How much each view magnifies the implant's middle."""
+    """Magnification of the implant's centroid in each view."""
     middle = torch.tensor(implant.centroid, dtype=torch.float64, device="cpu")
     _, depths = geometry.project(middle[None])
     magnified: list[float] = (geometry.detector_distances / depths[:, 0]).tolist()
@@ -90,26 +93,26 @@ def _magnifications(geometry: ConeBeamGeometry, implant: trimesh.Trimesh) -> lis
 
 
 def panel_of(recipe: Recipe) -> FlatPanel:
-    """The detector of a recipe, and its tube's focal spot."""
-    asked = recipe.panel
+    """Detector of a recipe, with the focal spot of its tube."""
+    settings = recipe.panel
     return FlatPanel(
         focal_spot_mm=recipe.tube.focal_spot,
-        half_contrast_lp_mm=asked.half_contrast_lp_mm,
-        glare=asked.glare,
-        glare_reach_mm=asked.glare_reach,
-        photons=asked.photons if asked.noise else float("inf"),
-        electronic_noise=asked.electronic_noise if asked.noise else 0.0,
-        open_beam=asked.open_beam,
-        offset=asked.offset,
-        bits=asked.bits,
-        gain_error=asked.gain_error,
-        dead_pixels=asked.dead_pixels,
+        half_contrast_lp_mm=settings.half_contrast_lp_mm,
+        glare=settings.glare,
+        glare_reach_mm=settings.glare_reach,
+        photons=settings.photons if settings.noise else float("inf"),
+        electronic_noise=settings.electronic_noise if settings.noise else 0.0,
+        open_beam=settings.open_beam,
+        offset=settings.offset,
+        bits=settings.bits,
+        gain_error=settings.gain_error,
+        dead_pixels=settings.dead_pixels,
         seed=recipe.seed,
     )
 
 
 def views_of(recipe: ScannerRecipe) -> ConeBeamGeometry:
-    """The views of a recipe that names no geometry file.
+    """Views of a recipe that has no geometry file.
 
     Raises:
         ValueError: If a view is not in the scan.
@@ -135,7 +138,7 @@ def views_of(recipe: ScannerRecipe) -> ConeBeamGeometry:
 def _primaries(
     geometry: ConeBeamGeometry, parts: list[Part], spectrum: Spectrum, factor: int, label: str | None
 ) -> Tensor:
-    """What passes of the beam in each view (V, rows, cols), averaged over pixels, after the exponential."""
+    """Transmitted share of the beam (V, rows, cols), averaged over each pixel after the exponential."""
     fine = geometry.refined(factor)
     beam: Beam | None = None
     images = []

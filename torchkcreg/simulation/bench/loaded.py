@@ -1,4 +1,4 @@
-"""A specimen under a load: where its implant, its fragments, screws and beads go."""
+"""A specimen under load: the motion of its implant, bone fragments, screws and beads."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from torchkcreg.simulation.loads import Load
 from .recipe import LoadRecipe
 from .specimen import DISTAL, PROXIMAL, Specimen
 
-_PITCH_MM = 0.4  # of the finite elements' nodes, or less: a tenth of the implant's thickness
-_NEAR_MM = 8.0  # of a screw's head: the implant there tells how it moves
-_HIGHEST = 0.99  # quantile that a plate's highest stresses are: beside holes they peak
-_TURN_MM = 20.0  # by which turns and shifts weigh alike
+_PITCH_MM = 0.4  # largest node spacing of the finite elements; less if a tenth of the implant's thickness is less
+_NEAR_MM = 8.0  # the screw follows the implant's vertices within this distance of its head
+_HIGHEST = 0.99  # quantile taken as the highest stress: the maximum itself is a peak beside a hole
+_TURN_MM = 20.0  # lever arm that makes rotations and translations comparable
 
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """Where a load takes a specimen.
+    """Motion of a specimen's parts under a load.
 
     Attributes:
-        implant: Maps points (..., 3) of the undeformed implant.
-        fragments: Rigid motion (4, 4) of each.
-        screws: Rigid motion (4, 4) of each.
-        carried: What the implant carries, where a force bends it.
+        implant: Maps points (..., 3) of the undeformed implant to their loaded positions.
+        fragments: Rigid motion (4, 4) of each bone fragment, by name.
+        screws: Rigid motion (4, 4) of each screw.
+        carried: Load carried by the implant; None unless a force bends it.
     """
 
     implant: Callable[[Tensor], Tensor]
@@ -51,15 +51,16 @@ class Loaded:
 
 
 class ElasticConstruct:
-    """An implant on screws that are rigid in two rigid fragments: how it bends under forces on the proximal one.
+    """Elastic implant on two rigid bone fragments, bent by a force on the proximal fragment.
 
-    Small strains, finite rotations; the arm of a force does not change as the implant bends.
+    The screws are rigidly fixed in the fragments. Small strains, finite rotations; the lever arm of a force does not
+    change as the implant bends.
 
     Args:
-        specimen: With screws in both fragments.
+        specimen: Specimen with screws in both fragments.
 
     Raises:
-        ValueError: If a fragment has no screw, or the implant's elastic constants are not known.
+        ValueError: If a fragment has no screw, or the implant material's elastic constants are not available.
     """
 
     def __init__(self, specimen: Specimen) -> None:
@@ -79,37 +80,38 @@ class ElasticConstruct:
         self.places, self.sides = places, sides
 
     def amounts(self, force: Tensor, at: Tensor) -> Tensor:
-        """Amounts (A,) for which each fragment's holds move as one body and the proximal ones take a force.
+        """Deformation amounts (A,) of the superelement under a force on the proximal fragment.
 
-        Holds without a screw carry nothing; the fragments' motions are unknowns, too.
+        The holds (screw seats) of each fragment move as one rigid body, and those of the proximal one take the force.
+        Holds without a screw carry no load. The motions of the fragments are unknowns of the same linear system.
 
         Args:
-            force: (3,), N.
-            at: Where it acts on the proximal fragment, (3,), mm.
+            force: Force (3,), N.
+            at: Point (3,) of the proximal fragment where the force acts, mm.
         """
         element, number = self.element, self.element.num_amounts
         loads, used = element.loads, sorted(self.sides)
-        alike = loads.new_tensor([1.0] * 3 + [_TURN_MM] * 3)
-        held = (hold_motions(element, used) * alike).flatten(1)  # (A, 6 U)
+        scale = loads.new_tensor([1.0] * 3 + [_TURN_MM] * 3)
+        held = (hold_motions(element, used) * scale).flatten(1)  # (A, 6 U)
         rigid = held.new_zeros(6 * len(used), 12)
         for row, hold in enumerate(used):
             first = 6 if self.sides[hold] == PROXIMAL else 0
-            rigid[6 * row : 6 * row + 6, first : first + 6] = -alike[:, None] * rigid_at(self.places[hold])
+            rigid[6 * row : 6 * row + 6, first : first + 6] = -scale[:, None] * rigid_at(self.places[hold])
         proximal = [hold for hold in used if self.sides[hold] == PROXIMAL]
         arms = (self.places[proximal] - at).expand(number, -1, 3)
         moments = loads[:, proximal, 3:] + torch.linalg.cross(arms, loads[:, proximal, :3])
         wrench = torch.cat([loads[:, proximal, :3].sum(1), moments.sum(1) / _TURN_MM], dim=1)  # (A, 6)
         free = [hold for hold in range(len(self.places)) if hold not in self.sides]
-        idle = loads[:, free] / alike
-        compliance = float(held.abs().max() / loads.abs().max())  # mm/N: so that rows weigh alike
+        idle = loads[:, free] / scale
+        compliance = float(held.abs().max() / loads.abs().max())  # mm/N: gives all rows the same scale
         known = torch.cat([wrench, idle.flatten(1)], dim=1).T * compliance
         rows = torch.cat([torch.cat([held.T, rigid], dim=1), torch.cat([known, known.new_zeros(len(known), 12)], 1)])
-        right = rows.new_zeros(len(rows))
-        right[6 * len(used) : 6 * len(used) + 3] = force * compliance
-        return torch.linalg.lstsq(rows, right[:, None], driver="gelsd").solution[:number, 0]
+        right_hand_side = rows.new_zeros(len(rows))
+        right_hand_side[6 * len(used) : 6 * len(used) + 3] = force * compliance
+        return torch.linalg.lstsq(rows, right_hand_side[:, None], driver="gelsd").solution[:number, 0]
 
     def loaded(self, recipe: LoadRecipe) -> Loaded:
-        """Where a force takes the specimen; the distal fragment stays, but for the pose."""
+        """Motion of the specimen under a force. The distal fragment moves only by the recipe's pose."""
         bone = self.specimen.recipe.limb.bone
         middle = (0.0, 0.0) if bone is None else bone.axis[:2]
         at = torch.tensor(recipe.at or (*middle, self.specimen.fracture), dtype=torch.float64, device="cpu")
@@ -131,37 +133,39 @@ class ElasticConstruct:
         return Loaded(motion, fragments, screws, CarriedLoad.of(self.element, amounts))
 
     def _held(self) -> dict[str, Tensor]:
-        """Points (n, 3) of the implant that each fragment's screws hold."""
-        where = transform_points(self.element.hexahedra.frame, self.element.hexahedra.positions)
+        """Points (n, 3) of the implant held by the screws of each fragment."""
+        nodes = transform_points(self.element.hexahedra.frame, self.element.hexahedra.positions)
         return {
-            side: torch.cat([where[_hold_nodes(self.element, hold)] for hold, own in self.sides.items() if own == side])
+            side: torch.cat(
+                [nodes[_hold_nodes(self.element, hold)] for hold, hold_side in self.sides.items() if hold_side == side]
+            )
             for side in (DISTAL, PROXIMAL)
         }
 
     def _check_strength(self, amounts: Tensor) -> None:
         surface = torch.from_numpy(np.array(self.specimen.implant.vertices))
         stress = float(von_mises(self.element.stress(surface, amounts)).quantile(_HIGHEST))
-        bears = self.element.constants.yield_stress
-        if stress > bears:
+        yield_stress = self.element.constants.yield_stress
+        if stress > yield_stress:
             alloy = self.specimen.recipe.implant.material
             warnings.warn(
-                f"the implant is stressed to {stress:.0f} N/mm^2: {alloy} yields at {bears:.0f}", stacklevel=4
+                f"the implant is stressed to {stress:.0f} N/mm^2: {alloy} yields at {yield_stress:.0f}", stacklevel=4
             )
 
 
 def pose_of(recipe: LoadRecipe) -> Tensor:
-    """Where the whole stands (4, 4)."""
+    """Rigid pose (4, 4) of the whole specimen."""
     turn = torch.deg2rad(torch.tensor(recipe.rotation, dtype=torch.float64, device="cpu"))
     return rigid_matrix(turn, torch.tensor(recipe.translation, dtype=torch.float64, device="cpu"))
 
 
 def loaded(specimen: Specimen, recipe: LoadRecipe, construct: ElasticConstruct | None = None) -> Loaded:
-    """Where a load takes a specimen.
+    """Motion of a specimen's parts under a load.
 
     Args:
-        specimen: Without load.
+        specimen: Specimen without load.
         recipe: The load.
-        construct: Of the specimen, where it has been made already: making it takes seconds.
+        construct: Elastic model of the specimen if it exists already: building it takes seconds.
 
     Raises:
         ValueError: As `ElasticConstruct` and `Load` do.
@@ -187,7 +191,7 @@ def loaded(specimen: Specimen, recipe: LoadRecipe, construct: ElasticConstruct |
 
 
 def _of_motion(specimen: Specimen, motion: Callable[[Tensor], Tensor]) -> Loaded:
-    """The specimen's other parts, which go as the implant does beside their screws."""
+    """Motion of all parts when the implant's is given: screws and fragments follow the implant near the screws."""
     vertices = torch.from_numpy(np.array(specimen.implant.vertices))
     moved = motion(vertices)
     near: dict[str, list[Tensor]] = {DISTAL: [], PROXIMAL: []}

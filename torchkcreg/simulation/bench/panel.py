@@ -1,7 +1,7 @@
-"""A flat panel as its physics has it: focal spot, scatter, scintillator, glare, quanta, faults, saturation.
+"""Physical model of a flat-panel detector: focal spot, scatter, scintillator, glare, quanta, faults, saturation.
 
-None of it is the registration's own model: blur is a transfer function, not a Gaussian; scatter a sum of kernels whose
-strength and reach depend on what they pass (after Sun and Star-Lack 2010), not a blurred image.
+It differs from the registration's model on purpose. Blur is a transfer function, not a Gaussian. Scatter is a sum of
+kernels whose strength and reach depend on the object's thickness (after Sun and Star-Lack 2010), not a blurred image.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, pad
 
 _SCATTER_MM = 4.0  # pitch on which scatter is computed: it is smooth
-_KERNELS = ((15.0, 0.5), (40.0, 1.0))  # reach in mm behind thin and thick objects, and how much of it each makes
-_THICK = 2.0  # line integral at which half of the scatter is that of thick objects
+_KERNELS = ((15.0, 0.5), (40.0, 1.0))  # (reach in mm, amplitude) for thin and for thick objects
+_THICK = 2.0  # line integral at which half of the scatter comes from the kernel of thick objects
 _ABSORBED, _REMOVED = 0.25, 0.9  # scatter comes from p^a ln(1/p)^b
-_SHADOW = 0.9  # primary below which a pixel is behind the object
-_REACHES = 8.0  # of a tail beyond an image
+_SHADOW = 0.9  # pixels with a smaller primary count as behind the object
+_REACHES = 8.0  # padding around the image, in multiples of the blur's reach
 
 
 @dataclass(frozen=True)
 class FlatPanel:
-    """What happens between the transmitted beam and the numbers in a file.
+    """Detector model, from the transmitted beam to the counts in a file.
 
     Attributes:
         focal_spot_mm: Width of a square focal spot.
         half_contrast_lp_mm: Spatial frequency at which the scintillator keeps half of the contrast, `1 / (1 + f^2 /
             f_half^2)`.
         glare: Share of the light that spreads in the panel, `exp(-r / reach)`.
-        glare_reach_mm: Its reach.
-        photons: Quanta a pixel of the open beam; infinite: no quantum noise. They are drawn before the scintillator
-            spreads them, so that noise is correlated.
-        electronic_noise: Standard deviation, counts.
+        glare_reach_mm: Reach of the glare, mm.
+        photons: Quanta per pixel in the open beam; infinite: no quantum noise. They are drawn before the scintillator
+            spreads them, so the noise is correlated.
+        electronic_noise: Standard deviation of the electronic noise, counts.
         open_beam: Counts of the open beam.
         offset: Counts without a beam.
         bits: The largest count is `2^bits - 1`.
-        gain_error: Standard deviation of what pixels' gains are off after their correction.
-        dead_pixels: Share of pixels that read nothing.
-        seed: Of gains and dead pixels, which are the panel's own.
+        gain_error: Standard deviation of the pixels' relative gain errors after correction.
+        dead_pixels: Share of pixels that always read zero.
+        seed: Seed of the gain errors and dead pixels, which are the same in all images of a panel.
     """
 
     focal_spot_mm: float = 0.3
@@ -59,18 +59,18 @@ class FlatPanel:
 
     @property
     def saturation(self) -> int:
-        """The largest count, at which a pixel is full."""
+        """The largest count."""
         return 2**self.bits - 1
 
     def penumbra(self, primary: Tensor, pixel_spacing: Sequence[float], magnification: float) -> Tensor:
-        """The primary (rows, cols) behind objects that the beam magnifies so much, as a focal spot of a size has it."""
+        """Primary (rows, cols) blurred by the focal spot at the object's magnification."""
         width = self.focal_spot_mm * (magnification - 1)
         if width <= 0:
             return primary
         return _filtered(primary, pixel_spacing, width, lambda fv, fu: torch.sinc(width * fv) * torch.sinc(width * fu))
 
     def detected(self, signal: Tensor, pixel_spacing: Sequence[float]) -> Tensor:
-        """What the scintillator makes of a signal (rows, cols): its sharp light and its glare."""
+        """Signal (rows, cols) blurred by the scintillator and its glare."""
 
         def transfer(fv: Tensor, fu: Tensor) -> Tensor:
             squared = fv.square() + fu.square()
@@ -81,7 +81,7 @@ class FlatPanel:
         return _filtered(signal, pixel_spacing, self.glare_reach_mm, transfer)
 
     def counts(self, signal: Tensor, pixel_spacing: Sequence[float], generator: torch.Generator) -> Tensor:
-        """Counts (rows, cols), uint16, of a signal in units of the open beam."""
+        """Counts (rows, cols), uint16, of a signal given in units of the open beam."""
         if math.isfinite(self.photons):
             signal = torch.poisson(signal * self.photons, generator=generator) / self.photons
         gain, dead = _faults(self, tuple(signal.shape))
@@ -93,17 +93,17 @@ class FlatPanel:
 
 @lru_cache(maxsize=1)
 def _faults(panel: FlatPanel, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Gains of pixels and which of them are dead, (rows, cols): the same in every view."""
-    own = torch.Generator(device="cpu").manual_seed(panel.seed)
-    normal = torch.randn(shape, dtype=torch.float64, generator=own, device="cpu")
-    even = torch.rand(shape, dtype=torch.float64, generator=own, device="cpu")
-    return 1 + panel.gain_error * normal, even < panel.dead_pixels
+    """Pixel gains and mask of dead pixels (rows, cols), the same in every view."""
+    generator = torch.Generator(device="cpu").manual_seed(panel.seed)
+    normal = torch.randn(shape, dtype=torch.float64, generator=generator, device="cpu")
+    uniform = torch.rand(shape, dtype=torch.float64, generator=generator, device="cpu")
+    return 1 + panel.gain_error * normal, uniform < panel.dead_pixels
 
 
 def scatter_shapes(primaries: Tensor, pixel_spacing: Sequence[float]) -> Tensor:
-    """Scatter (V, rows, cols) behind objects that leave so much of the beam, in arbitrary units.
+    """Scatter (V, rows, cols) for given primaries, in arbitrary units.
 
-    Objects go on above and below the panel; beside it is air.
+    The object is assumed to continue above and below the panel, with air to its left and right.
     """
     (rows, cols), (dv, du) = primaries.shape[-2:], pixel_spacing
     coarse_shape = (max(1, round(rows * dv / _SCATTER_MM)), max(1, round(cols * du / _SCATTER_MM)))
@@ -119,7 +119,7 @@ def scatter_shapes(primaries: Tensor, pixel_spacing: Sequence[float]) -> Tensor:
 
 
 def scattered(primaries: Tensor, pixel_spacing: Sequence[float], scatter_to_primary: float) -> Tensor:
-    """Scatter (V, rows, cols) whose mean over all shadows is so much of the primary's there."""
+    """Scatter (V, rows, cols), scaled to a given ratio of mean scatter to mean primary in the object's shadow."""
     if scatter_to_primary == 0 or not bool((primaries < _SHADOW).any()):
         return torch.zeros_like(primaries)
     shape = scatter_shapes(primaries, pixel_spacing)
@@ -127,18 +127,20 @@ def scattered(primaries: Tensor, pixel_spacing: Sequence[float], scatter_to_prim
 
 
 def mean_ratio(scatter: Tensor, primaries: Tensor) -> float:
-    """Mean scatter over mean primary in all shadows; zero where there is none."""
+    """Mean scatter over mean primary in the object's shadow; zero if there is no shadow."""
     shadow = primaries < _SHADOW
     return float(scatter[shadow].mean() / primaries[shadow].mean()) if bool(shadow.any()) else 0.0
 
 
 def _spread(source: Tensor, pitch: Sequence[float], reach: float) -> Tensor:
-    """Sources (V, rows, cols) spread by a kernel `(1 + (r / reach)^2)^-1.5` of the sum one."""
+    """Sources (V, rows, cols) convolved with the kernel `(1 + (r / reach)^2)^-1.5`, normalised to a sum of one."""
     margin = [math.ceil(3 * reach / p) for p in pitch]
     padded = pad(source[:, None], (0, 0, margin[0], margin[0]), mode="replicate")
     padded = pad(padded, (margin[1], margin[1]))[:, 0]
-    away = [torch.fft.fftfreq(n, 1 / n, dtype=source.dtype, device="cpu") * p for n, p in zip(padded.shape[1:], pitch)]
-    kernel = (1 + (away[0][:, None].square() + away[1].square()) / reach**2) ** -1.5
+    offsets = [
+        torch.fft.fftfreq(n, 1 / n, dtype=source.dtype, device="cpu") * p for n, p in zip(padded.shape[1:], pitch)
+    ]
+    kernel = (1 + (offsets[0][:, None].square() + offsets[1].square()) / reach**2) ** -1.5
     product = torch.fft.rfft2(padded) * torch.fft.rfft2(kernel / kernel.sum())
     spread = torch.fft.irfft2(product, s=padded.shape[1:])
     rows, cols = source.shape[1:]
@@ -148,7 +150,7 @@ def _spread(source: Tensor, pitch: Sequence[float], reach: float) -> Tensor:
 def _filtered(
     image: Tensor, pixel_spacing: Sequence[float], reach: float, transfer: Callable[[Tensor, Tensor], Tensor]
 ) -> Tensor:
-    """An image (rows, cols) by a transfer function of frequencies (fv, fu) in 1/mm; it is mirrored at its edges."""
+    """Filter an image (rows, cols) by a transfer function of (fv, fu) in 1/mm, mirrored at the image's edges."""
     rows, cols = image.shape
     margins = [
         min(math.ceil(_REACHES * reach / d) + 4, n - 1) for d, n in zip(pixel_spacing, (rows, cols), strict=True)
@@ -156,5 +158,5 @@ def _filtered(
     wide = pad(image[None, None], (margins[1], margins[1], margins[0], margins[0]), mode="reflect")[0, 0]
     fv = torch.fft.fftfreq(wide.shape[0], pixel_spacing[0], dtype=image.dtype, device="cpu")
     fu = torch.fft.rfftfreq(wide.shape[1], pixel_spacing[1], dtype=image.dtype, device="cpu")
-    found = torch.fft.irfft2(torch.fft.rfft2(wide) * transfer(fv[:, None], fu), s=wide.shape)
-    return found[margins[0] : margins[0] + rows, margins[1] : margins[1] + cols].clamp_min(0)
+    filtered = torch.fft.irfft2(torch.fft.rfft2(wide) * transfer(fv[:, None], fu), s=wide.shape)
+    return filtered[margins[0] : margins[0] + rows, margins[1] : margins[1] + cols].clamp_min(0)

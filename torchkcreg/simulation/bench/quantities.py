@@ -1,4 +1,4 @@
-"""Quantities with units, as people write them in a file: ``188 mm``, ``90 kV``, ``[0, -300, 0] N``."""
+"""Quantities with units, as written in a recipe file: `188 mm`, `90 kV`, `[0, -300, 0] N`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _vector(kind: str) -> Callable[[Any], tuple[float, ...]]:
             raise ValueError(
                 f"must be three of {_A[kind]} such as '[0, 0, 1] {_example(kind).split()[-1]}', got {value!r}"
             )
-        return tuple(number(f"{one} {unit}" if unit else one) for one in value)
+        return tuple(number(f"{element} {unit}" if unit else element) for element in value)
 
     return parsed
 
@@ -73,16 +73,16 @@ def _vector_text(unit: str) -> PlainSerializer:
 
 Vector3 = tuple[float, float, float]
 Length = Annotated[float, BeforeValidator(_number("length")), _scalar_text("mm")]
-"""A length, mm inside; a unit is required."""
+"""A length, stored in mm; a unit is required."""
 Angle = Annotated[float, BeforeValidator(_number("angle")), _scalar_text("deg")]
-"""An angle, degrees inside; a unit is required."""
+"""An angle, stored in degrees; a unit is required."""
 Voltage = Annotated[float, BeforeValidator(_number("voltage")), _scalar_text("kV")]
-"""A tube voltage, kV inside; a unit is required."""
+"""A tube voltage, stored in kV; a unit is required."""
 Share = Annotated[float, BeforeValidator(_number("share"))]
-"""A share of one: a number, or per cent."""
+"""A fraction: a plain number or a percentage."""
 Place = Annotated[Vector3, BeforeValidator(_vector("length")), _vector_text("mm")]
-"""A point or a translation, mm inside."""
+"""A point or a translation, stored in mm."""
 Turn = Annotated[Vector3, BeforeValidator(_vector("angle")), _vector_text("deg")]
-"""A rotation vector, degrees inside."""
+"""A rotation vector, stored in degrees."""
 Push = Annotated[Vector3, BeforeValidator(_vector("force")), _vector_text("N")]
-"""A force along each axis, N inside."""
+"""A force vector, stored in N."""

@@ -1,4 +1,4 @@
-"""What a simulated experiment is made of, as a file says it: implant, screws, limb and loads, and the whole of it."""
+"""Recipe file of a simulated experiment: tube, detector, scanner, implant, screws, limb and loads."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from .quantities import Angle, Length, Place, Push, Share, Turn, Voltage
 
 
 class TubeRecipe(Config):
-    """The beam: a tungsten tube behind its filters, as the scintillator absorbs it, or a table.
+    """The X-ray tube: a tungsten anode with filters, or a table of the detected spectrum.
+
+    The computed spectrum is weighted by the scintillator's absorption.
 
     Attributes:
-        voltage: Without SpekPy one of 70, 80, ... 120 kV.
-        anode: Its angle; other than 12 degrees with SpekPy alone.
-        filtration: Materials and thicknesses.
-        spectrum: Table of the detected spectrum in place of all of that, relative to the recipe's file.
-        focal_spot: Its width, which blurs by the scanner's magnification.
+        voltage: Tube voltage. Without SpekPy one of 70, 80, ... 120 kV.
+        anode: Anode angle. Angles other than 12 degrees need SpekPy.
+        filtration: Thickness of each filter, by material.
+        spectrum: File of the detected spectrum, relative to the recipe's file. It replaces the settings above.
+        focal_spot: Width of the focal spot; its blur depends on the magnification.
     """
 
     voltage: Voltage = 90.0
@@ -33,7 +35,7 @@ class TubeRecipe(Config):
 
 
 class PanelRecipe(Config):
-    """The detector, see `FlatPanel`; `gain_error`, `offset` and `dead_pixels` are what its correction has left."""
+    """The detector, see `FlatPanel`; `gain_error`, `offset` and `dead_pixels` are residuals after its correction."""
 
     scintillator: Length = Field(0.6, gt=0)
     half_contrast_lp_mm: float = Field(1.6, gt=0)
@@ -51,18 +53,21 @@ class PanelRecipe(Config):
 
 
 class ScannerRecipe(Config):
-    """Where the views are taken from: the three-source extremity scanner, others built like it, or a geometry file.
+    """The views: the three-source extremity scanner, a scanner of the same design, or a geometry file.
 
     Attributes:
-        geometry: File of projection matrices, relative to the recipe's, in place of the rest.
-        sad, sdd: From the sources to the axis and to the detector.
-        pixel: Its pitch.
-        rows, cols: Pixels that are read, about the panel's middle.
-        binning: Pixels along each side that are binned into one, after that.
-        sources: Height of each focal spot, by name, as they fire in turn.
-        firing_order: Their names.
-        views: Numbers of the scan's views; all where None.
-        num_views, step: Of a scan; `phase` is an angle at which the first source fires.
+        geometry: File of projection matrices, relative to the recipe's file. It replaces all other settings.
+        sad, sdd: Distance from the sources to the rotation axis and to the detector.
+        pixel: Pixel pitch.
+        rows, cols: Pixels that are read, centred on the panel.
+        binning: Pixels along each side that are binned into one, after the cropping.
+        sources: Height of each focal spot, by name.
+        firing_order: Names of the focal spots in the order in which they fire.
+        num_views: Number of views of the whole scan.
+        step: Gantry angle between successive views.
+        start: Gantry angle of the first view.
+        phase: A gantry angle at which the first source of `firing_order` fires.
+        views: Numbers of the scan's views that are simulated; all where None.
     """
 
     geometry: Path | None = None
@@ -82,11 +87,11 @@ class ScannerRecipe(Config):
 
 
 class PlateShape(Config):
-    """A parametric plate along z, the bone on the side of negative y; see `locking_plate`.
+    """A parametric plate along z, with the bone at negative y; see `locking_plate`.
 
     Attributes:
-        bow, twist: Between the ends of the undeformed plate: it is contoured.
-        flare: Width of the upper end over that of the shaft.
+        bow, twist: Contouring of the undeformed plate: bending and torsion angle between its ends.
+        flare: Width of the upper end divided by the width of the shaft.
     """
 
     length: Length = 188.0
@@ -104,9 +109,9 @@ class ImplantRecipe(Config):
     """The undeformed implant: a parametric plate, or a closed mesh in mm whose frame is the world's.
 
     Attributes:
-        mesh: File, relative to the recipe's.
-        plate: In its place.
-        material: Of it.
+        mesh: File of the mesh, relative to the recipe's file.
+        plate: Parametric plate, instead of a mesh.
+        material: Name of the implant's material.
     """
 
     mesh: Path | None = None
@@ -121,21 +126,22 @@ class ImplantRecipe(Config):
 
 
 class HeadRecipe(Config):
-    """A screw's head, that stands proud of the plate and of which `screws.json` does not know."""
+    """A screw's head above the plate. It is in the images but not in `screws.json`."""
 
     radius: Length = 3.4
     height: Length = 2.0
 
 
 class ScrewsRecipe(Config):
-    """Screws: those of a file, or one in each of the holes that are named.
+    """Screws, from a file or one in each of the given holes.
 
     Attributes:
-        file: As `--components` takes it, relative to the recipe's.
-        holes: Of the implant, counted from 0 at its lower end.
-        length, radius, material: Of each; as the implant's where no material is named.
-        tilt: Largest angle against the hole's axis, drawn by the seed.
-        heads: None stand proud unless described.
+        file: File of screws as for `--components`, relative to the recipe's file.
+        holes: Holes of the implant that have a screw, counted from 0 at its lower end.
+        length, radius: Size of every screw.
+        material: Material of every screw; the implant's if None.
+        tilt: Largest angle between a screw and its hole's axis. The angles are random.
+        heads: Heads above the plate; none if None.
     """
 
     file: Path | None = None
@@ -154,15 +160,16 @@ class ScrewsRecipe(Config):
 
 
 class BoneRecipe(Config):
-    """A hollow bone along z behind the implant, in two fragments, or as one where the gap is zero.
+    """A hollow bone along z behind the implant, in two fragments that touch if the gap is zero.
 
     Attributes:
-        axis: A point on its axis.
-        outer_radius, inner_radius: Of its wall.
-        gap: Between the fragments, about `gap_at`.
-        gap_at: Height of the fracture: screws below it hold the distal fragment.
-        reach: How far each fragment goes from there.
-        material, marrow: Of the wall, and of what fills it; nothing fills it unless named.
+        axis: A point on the bone's axis.
+        outer_radius, inner_radius: Radii of the cortex.
+        gap: Distance between the fragments, centred on `gap_at`.
+        gap_at: Height of the fracture. Screws below it hold the distal fragment.
+        reach: Distance from the fracture to the far end of each fragment.
+        material: Material of the cortex.
+        marrow: Material that fills the bone; empty if None.
     """
 
     axis: Place = (0.0, -17.0, 0.0)
@@ -176,12 +183,14 @@ class BoneRecipe(Config):
 
 
 class TissueRecipe(Config):
-    """What is around the bone: a cylinder along z, or a closed mesh.
+    """Soft tissue or water around the bone: a cylinder along z, or a closed mesh.
 
     Attributes:
+        radius: Radius of the cylinder.
         axis: A point on the cylinder's axis, mm; the bone's where None.
-        half_length: Of it, about the axis' point.
-        mesh: File, relative to the recipe's, in its place.
+        half_length: Half the cylinder's length, measured from the point `axis`.
+        mesh: File of a mesh instead of the cylinder, relative to the recipe's file.
+        material: Name of the material.
     """
 
     radius: Length | None = None
@@ -198,7 +207,7 @@ class TissueRecipe(Config):
 
 
 class InsertRecipe(Config):
-    """A rod in the tissue, such as calcium inserts: `calcium` in mg/mL of water, or a material."""
+    """A rod in the tissue: a calcium insert (`calcium_mg_ml`, mg per mL of water), or a rod of another material."""
 
     start: Place
     end: Place
@@ -214,16 +223,21 @@ class InsertRecipe(Config):
 
     @property
     def substance(self) -> str:
-        """Name of its material."""
+        """Name of the rod's material."""
         return self.material or f"ca{self.calcium_mg_ml:g}"
 
 
 class LimbRecipe(Config):
-    """What stands in the beam besides the implant and its screws.
+    """Bone, tissue, inserts and beads around the implant.
 
     Attributes:
-        mesh: Closed mesh of a bone that does not move, in place of `bone`; screws cut holes into it.
-        beads: Centres of steel beads of 1 mm radius, each in the fragment at its height.
+        bone: Parametric bone of two fragments.
+        mesh: File of the closed mesh of a bone that does not move. Screws cut holes into it.
+        mesh_material: Material of that bone.
+        tissue: Tissue around everything.
+        inserts: Rods in the tissue.
+        beads: Centres of steel beads, each attached to the fragment at its height.
+        bead_radius: Radius of the beads.
     """
 
     bone: BoneRecipe | None = None
@@ -236,21 +250,21 @@ class LimbRecipe(Config):
 
     @property
     def axis(self) -> tuple[float, float, float]:
-        """A point on the axis of cylindrical tissue, mm: its own, or the bone's."""
-        own = None if self.tissue is None else self.tissue.axis
-        return own or ((0.0, 0.0, 0.0) if self.bone is None else self.bone.axis)
+        """A point on the axis of the tissue cylinder, mm; on the bone's axis if the tissue has none."""
+        tissue_axis = None if self.tissue is None else self.tissue.axis
+        return tissue_axis or ((0.0, 0.0, 0.0) if self.bone is None else self.bone.axis)
 
 
 class LoadRecipe(Config):
-    """What happened to the implant in one configuration: forces, or angles that it was bent by; and where it stands.
+    """Load of one configuration: a force or bending angles, and a rigid misalignment.
 
     Attributes:
-        force: On the proximal fragment along the world's axes; the distal one is held. The implant bends as its finite
-            elements have it.
-        at: Where that acts; where None, on the bone's axis at the fracture's height.
-        bend, lateral, torsion, s_bend: Angles between the ends, in place of a force; see `Load`.
-        zone: They lie within this of the middle.
-        rotation, translation: Of the whole implant with its bone, about the origin.
+        force: Force on the proximal fragment along the world's axes, with the distal fragment held. The bending is
+            computed by finite elements.
+        at: Point where the force acts; if None, on the bone's axis at the height of the fracture.
+        bend, lateral, torsion, s_bend: Angles between the implant's ends, instead of a force; see `Load`.
+        zone: The implant is bent within this distance of its middle.
+        rotation, translation: Rigid motion of the implant with its bone, about the origin.
     """
 
     force: Push = (0.0, 0.0, 0.0)
@@ -271,7 +285,7 @@ class LoadRecipe(Config):
 
     @property
     def bent(self) -> bool:
-        """Angles are asked for."""
+        """True if a bending angle is given."""
         return any((self.bend, self.lateral, self.torsion, self.s_bend))
 
 
@@ -280,8 +294,8 @@ class Recipe(Config):
 
     Attributes:
         scatter_to_primary: Mean scatter over mean primary in the object's shadow, over all views.
-        configurations: Loads by the name that their images will have.
-        seed: Of noise, tilts and the panel's faults.
+        configurations: Loads by configuration name, which is also the name of the images' file.
+        seed: Seed of the noise, the screws' tilts and the panel's faults.
     """
 
     implant: ImplantRecipe

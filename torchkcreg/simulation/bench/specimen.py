@@ -1,4 +1,4 @@
-"""A specimen out of a recipe: the implant, its screws and the limb around it, without load."""
+"""Build the unloaded specimen of a recipe: the implant, its screws and the limb around it."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ DISTAL, PROXIMAL = "distal", "proximal"
 
 @dataclass(frozen=True, eq=False)
 class Specimen:
-    """What a recipe describes, before any load; the implant's frame is the world's.
+    """The unloaded specimen of a recipe. The world's frame is the implant's.
 
     Attributes:
-        recipe: What it was made of.
-        implant: Closed mesh, mm.
-        holes: Of it.
-        screws: Of it.
-        bone: Mesh of a bone that does not move, where the recipe has one.
-        tissue: Mesh of what is around, where the recipe has one.
+        recipe: The recipe.
+        implant: Closed mesh of the implant, mm.
+        holes: Screw holes of the implant.
+        screws: Screws of the implant.
+        bone: Mesh of a bone that does not move; None if the recipe has none.
+        tissue: Mesh of the surrounding tissue; None if the recipe has none.
     """
 
     recipe: Recipe
@@ -44,34 +44,34 @@ class Specimen:
 
     @property
     def fracture(self) -> float:
-        """Height that parts the fragments, mm."""
+        """Height of the fracture between the fragments, mm."""
         return self.recipe.limb.bone.gap_at if self.recipe.limb.bone is not None else 0.0
 
     def fragment_of(self, height: float) -> str:
-        """The fragment at a height: distal below the fracture, proximal above."""
+        """Name of the fragment at a height: distal below the fracture, proximal above."""
         return DISTAL if height < self.fracture else PROXIMAL
 
     def beads(self) -> Tensor:
-        """Their centres (B, 3), mm."""
+        """Centres of the beads without load (B, 3), mm."""
         return torch.tensor(self.recipe.limb.beads, dtype=torch.float64, device="cpu").reshape(-1, 3)
 
     def beads_after(self, fragments: Mapping[str, Tensor]) -> Tensor:
-        """Where rigid motions (4, 4) of the fragments take them, (B, 3), mm."""
+        """Centres of the beads (B, 3), mm, after rigid motions (4, 4) of the fragments."""
         beads = self.beads()
         moved = [transform_points(fragments[self.fragment_of(float(bead[2]))], bead[None]) for bead in beads]
         return torch.cat([beads[:0], *moved])
 
     @property
     def head(self) -> HeadRecipe | None:
-        """What screws have that no list knows."""
+        """Screw heads that are imaged but not in the list of screws."""
         return self.recipe.screws.heads
 
 
 def parametric_plate(shape: PlateShape) -> trimesh.Trimesh:
-    """A contoured plate as a recipe describes it.
+    """Mesh of a recipe's contoured plate.
 
     Raises:
-        ValueError: If it is impossible, such as holes wider than the plate.
+        ValueError: If the shape is impossible, such as holes wider than the plate.
     """
     plate = locking_plate(
         length=shape.length,
@@ -97,14 +97,18 @@ def specimen(
     bone: trimesh.Trimesh | None = None,
     tissue: trimesh.Trimesh | None = None,
 ) -> Specimen:
-    """The specimen of a recipe.
+    """Build the specimen of a recipe.
 
     Args:
-        recipe: What it is made of.
-        implant, screws, bone, tissue: What the files hold that the recipe names.
+        recipe: The recipe.
+        implant: Mesh from the recipe's implant file; None for a parametric plate.
+        screws: Screws from the recipe's file; None for screws in holes.
+        bone: Mesh from the recipe's bone file, if it has one.
+        tissue: Mesh from the recipe's tissue file, if it has one.
 
     Raises:
-        ValueError: If a screw is asked for in a hole that the implant does not have, or a mesh is not closed.
+        ValueError: If a screw is to go into a hole that the implant does not have, the implant's mesh is missing, or a
+            mesh is not closed.
     """
     shape = recipe.implant.plate
     if implant is None and shape is not None:
@@ -121,24 +125,26 @@ def specimen(
 
 
 def _screws_in_holes(recipe: Recipe, holes: list[Hole]) -> list[Screw]:
-    wanted, rng = recipe.screws, np.random.default_rng([recipe.seed, 31])
+    screw_recipe, rng = recipe.screws, np.random.default_rng([recipe.seed, 31])
     places = _places(holes)
-    if (wanted.holes and max(wanted.holes) >= len(places)) or min(wanted.holes, default=0) < 0:
-        raise ValueError(f"screws.holes must be among the {len(places)} holes of the implant, got {wanted.holes}")
-    found = []
-    for number, place in enumerate(wanted.holes):
+    if (screw_recipe.holes and max(screw_recipe.holes) >= len(places)) or min(screw_recipe.holes, default=0) < 0:
+        raise ValueError(f"screws.holes must be among the {len(places)} holes of the implant, got {screw_recipe.holes}")
+    screws = []
+    for number, place in enumerate(screw_recipe.holes):
         hole = places[place]
-        into = -hole.axis if hole.axis[1] > 0 else hole.axis  # the bone is on the side of negative y
-        direction = _tilted(into, math.radians(wanted.tilt), rng)
+        into = -hole.axis if hole.axis[1] > 0 else hole.axis  # the bone is at negative y
+        direction = _tilted(into, math.radians(screw_recipe.tilt), rng)
         start = hole.center - into * hole.depth / 2
-        end = start + wanted.length * direction
+        end = start + screw_recipe.length * direction
         ends = tuple(start.tolist()), tuple(end.tolist())
-        found.append(Screw(*ends, wanted.radius, wanted.material or recipe.implant.material, f"screw{number}"))
-    return found
+        screws.append(
+            Screw(*ends, screw_recipe.radius, screw_recipe.material or recipe.implant.material, f"screw{number}")
+        )
+    return screws
 
 
 def _places(holes: list[Hole]) -> list[Hole]:
-    """Holes from the lowest up; a combination hole, found as two, is its lower one."""
+    """Holes from the lowest up. Of a combination hole, which is found as two holes, only the lower one is kept."""
     places: list[Hole] = []
     for hole in holes:
         if not places or np.linalg.norm(hole.center - places[-1].center) > 2.2 * hole.radius:
@@ -155,7 +161,7 @@ def _tilted(axis: np.ndarray, most: float, rng: np.random.Generator) -> np.ndarr
 
 
 def recipe_files(recipe: Recipe) -> dict[str, Path]:
-    """Files that a recipe names, by what they are."""
+    """Files of a recipe, by content (implant, screws, bone, tissue, spectrum, geometry)."""
     limb, tissue = recipe.limb, recipe.limb.tissue
     named = {
         "implant": recipe.implant.mesh,
@@ -165,11 +171,11 @@ def recipe_files(recipe: Recipe) -> dict[str, Path]:
         "spectrum": recipe.tube.spectrum,
         "geometry": recipe.scanner.geometry,
     }
-    return {what: path for what, path in named.items() if path is not None}
+    return {content: path for content, path in named.items() if path is not None}
 
 
 def recipe_in(recipe: Recipe, folder: Path) -> Recipe:
-    """A recipe whose files are named in full, so that it may lie anywhere."""
+    """Recipe with absolute paths, resolved against the folder of its file."""
     limb, tissue = recipe.limb, recipe.limb.tissue
 
     def full(path: Path | None) -> Path | None:

@@ -1,4 +1,4 @@
-"""The two experiments of Cao et al. 2020 (section 2.4), simulated: what is imaged, registered, compared and drawn."""
+"""Simulations of the two experiments of Cao et al. 2020 (section 2.4), with their tables and figures."""
 
 from .experiment import packaged
 from .femoral import femoral_plate

@@ -1,4 +1,4 @@
-"""Steps of an experiment, each of which is kept in a folder of its own and not taken twice."""
+"""Steps of the paper's experiments. Each writes its own folder and is skipped if its result exists."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from torchkcreg.visualization import overlay_figure, series_figure
 
 _PITCH_MM = 0.8
 PAPER_SETTINGS = {"preset": "paper", "deformation": "ffd", "find_screws": False, "view_motion": "off"}
-_START_DEG, _START_MM = (0.8, -0.6, 1.0), (1.0, -1.2, 0.8)  # by which a registration's start is off
+_START_DEG, _START_MM = (0.8, -0.6, 1.0), (1.0, -1.2, 0.8)  # error of the start pose
 
 
 def draw_series(out: Path, case: Path, results: Mapping[str, RegistrationResult], view: int) -> list[Path]:
-    """Figures 3A and 3B of Cao et al. 2020: ``overlay.png`` and ``displacement.png``.
+    """Draw Figures 3A and 3B of Cao et al. 2020, `overlay.png` and `displacement.png`, and return their paths.
 
     Args:
-        out: Folder.
-        case: Of the images, `NAME.npz` for each result.
-        results: By the name of their configuration.
-        view: Number of the view over which the models are laid.
+        out: Output folder.
+        case: Folder of the images, `NAME.npz` for each result.
+        results: Registration results by configuration name.
+        view: Number of the view on which the models are overlaid.
     """
     geometry, mesh = read_geometry(case / "geometry.json").select([view]), read_mesh(case / "implant.stl")
     images, shadows, bent = [], [], {}
@@ -54,52 +54,52 @@ def draw_series(out: Path, case: Path, results: Mapping[str, RegistrationResult]
         torch.stack(images), torch.stack(shadows), view_labels=list(results), pixel_spacing=spacing
     )
     write_figure(out / "overlay.png", overlay)
-    panels = {name: (one.undeformed, one.vectors) for name, one in bent.items()}
+    panels = {name: (displacement.undeformed, displacement.vectors) for name, displacement in bent.items()}
     write_figure(out / "displacement.png", series_figure(panels, label="displacement against the distal end (mm)"))
     return [out / "overlay.png", out / "displacement.png"]
 
 
 @dataclass(frozen=True)
 class ViewSets:
-    """The paper's sets of views, of which only these are imaged.
+    """The paper's sets of views. Only these views are simulated.
 
     Attributes:
-        views: Numbers of the scan's views, by how many they are.
+        views: Numbers of the scan's views in each set, by the number of views.
     """
 
     views: dict[int, list[int]]
 
     @classmethod
     def of_paper(cls, *, quick: bool) -> ViewSets:
-        """Three views and twelve; the three alone where it is to be quick."""
+        """The sets of three and of twelve views; only three views if `quick`."""
         scanner = MultisourceScanner()
         return cls({int(n): scanner.paper_views(n) for n in (("3",) if quick else ("3", "12"))})
 
     @property
     def imaged(self) -> list[int]:
-        """All of them, in the scan's order."""
+        """Numbers of all views in the sets, in the scan's order."""
         return sorted({view for views in self.views.values() for view in views})
 
     def places(self, number: int) -> list[int]:
-        """Places of the views of a set among those that are imaged."""
+        """Indices of a set's views among the imaged views."""
         return [self.imaged.index(view) for view in self.views[number]]
 
 
 def packaged(name: str) -> dict[str, Any]:
-    """The recipe of an experiment, as its file has it."""
+    """Content of the packaged recipe file of an experiment."""
     text = (resources.files("torchkcreg.studies.paper") / f"{name}.yaml").read_text(encoding="utf-8")
     content: dict[str, Any] = yaml.safe_load(text)
     return content
 
 
 def simulated(content: Mapping[str, Any], folder: Path, **changes: Any) -> Path:
-    """The case folder of a recipe with changes on top; what is there is kept."""
+    """Simulate a recipe with changes and return the case folder. Existing images are kept."""
     simulate_files(Recipe.of({**content, **changes}, "recipe"), folder)
     return folder
 
 
 def start_of(folder: Path) -> Path:
-    """A file with a start pose that is off by one and a half millimetres and degrees."""
+    """Write `start.json`, a start pose with errors of about 1.8 mm and 1.4 degrees, and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     turn = torch.deg2rad(torch.tensor(_START_DEG, dtype=torch.float64, device="cpu"))
     pose = rigid_matrix(turn, torch.tensor(_START_MM, dtype=torch.float64, device="cpu"))
@@ -118,17 +118,17 @@ def registered(
     known: bool = True,
     implant: Path | None = None,
 ) -> RegistrationResult:
-    """The registration of a configuration, in its run folder; one that was broken off goes on.
+    """Register a configuration in its run folder. A finished run is read; an interrupted run is resumed.
 
     Args:
         case: Folder of the simulated case.
-        configuration: Of it.
-        views: Of the case that are used.
-        run: Folder.
+        configuration: Name of the configuration.
+        views: Indices of the case's views that are used.
+        run: Run folder.
         start: File of the start pose.
-        options: Of the registration.
-        known: Screws and spectrum are told.
-        implant: Another model of the undeformed implant than the case's.
+        options: Options of the registration.
+        known: Give screws and spectrum to the registration.
+        implant: File of an implant model to use instead of the case's.
     """
     if (run / "deformation.json").exists():
         return read_run(run)
@@ -145,12 +145,12 @@ def registered(
 
 
 def seconds_of(folder: Path) -> float:
-    """How long a run or a reconstruction took."""
+    """Duration of a run or a reconstruction in seconds."""
     return float(read_json(folder / "metrics.json", "metrics")["seconds"])
 
 
 def reconstructed(case: Path, configuration: str, out: Path, *, run: Path | None = None, **options: Any) -> Path:
-    """The volume of a configuration's scan; one that is there is kept."""
+    """Reconstruct a configuration's scan and return the volume's path. A finished volume is kept."""
     volume = out / "volume.mha"
     if not (out / "metrics.json").exists():
         files = ReconstructionFiles(
@@ -164,7 +164,7 @@ def reconstructed(case: Path, configuration: str, out: Path, *, run: Path | None
 
 
 def bench_model(implant: Mapping[str, Any], out: Path, *, size_mm: tuple[float, float, float]) -> Path:
-    """The volume of an undeformed implant's scan on a bench: FDK on voxels of 0.25 mm, the share of its metal."""
+    """Simulate a bench scan of the undeformed implant and return its metal fraction volume (FDK, 0.25 mm voxels)."""
     content = packaged("bench")
     case = simulated({**content, "implant": dict(implant)}, out / "scan")
     alone = {"method": "fdk", "single_material": implant["material"], "scatter": "none"}

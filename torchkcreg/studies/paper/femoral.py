@@ -1,4 +1,4 @@
-"""Experiment B: a bent femoral plate in water with rods of calcium, and its scan without and with it (Fig. 4 and 5)."""
+"""Experiment B: a bent femoral plate in water with calcium rods, registered and reconstructed (Fig. 4 and 5)."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from .experiment import PAPER_SETTINGS, ViewSets, packaged, reconstructed, regis
 CONFIGURATION = "deformed"
 _METHODS = {"FDK": "fdk", "PWLS": "pwls", "KC-Rec": "kcrec"}
 _QUICK_RECONSTRUCTION = {"spacing_mm": 1.6, "iterations": 10, "passes": 1}
-_INSIDE = 0.75  # of a rod's radius, where it is measured
-_WITHIN_MM = 40.0  # of the isocentre along z
-_NEAR_MM = 5.0  # of the metal: what streaks and blooming reach
+_INSIDE = 0.75  # share of a rod's radius that is measured
+_WITHIN_MM = 40.0  # distance from the isocentre along z that is measured
+_NEAR_MM = 5.0  # distance from the metal that streaks and blooming reach
 
 
 def femoral_plate(out: Path, *, quick: bool = False, known: bool = True, paper: bool = False) -> str:
-    """The experiment's tables; they, the figures and all that they are made of are left in a folder.
+    """Run the experiment, write all results and figures to a folder, and return its tables.
 
-    A titanium plate that was bent before it was put into a bath of water is registered from three views and from
-    twelve, and compared with its true shape: distances to the surface and to the nearest node, after rigid alignment by
-    coherent point drift. Its scan is then reconstructed by FDK, by PWLS and by KC-Rec with the registered plate. What
-    is there already is kept.
+    A titanium plate was bent before it was put into a water bath. It is registered from three and from twelve views and
+    compared with its true shape: distances to the surface and to the nearest node, after rigid alignment by coherent
+    point drift. Its scan is then reconstructed by FDK, by PWLS and by KC-Rec with the registered plate. Existing
+    results are kept.
 
     Args:
-        out: Folder to make.
-        quick: Three views, binned, and a scan of 50 views on coarse voxels: a few minutes.
-        known: Screws and spectrum are told.
-        paper: Register three views with the paper's own settings, too. Minutes.
+        out: Output folder, created if missing.
+        quick: Three binned views and a scan of 50 views on coarse voxels: takes a few minutes.
+        known: Give screws and spectrum to the registration.
+        paper: Also register three views with the paper's settings; takes minutes.
 
     Raises:
         FileExistsError: If the folder holds another experiment.
@@ -51,21 +51,30 @@ def femoral_plate(out: Path, *, quick: bool = False, known: bool = True, paper: 
     start, options = start_of(out), {"material": content["implant"]["material"]}
     jobs = [(number, False) for number in sorted(sets.views)] + ([(3, True)] if paper else [])
     rows = []
-    for number, own in jobs:
-        run = out / "runs" / f"{CONFIGURATION}-{number}{'-paper' if own else ''}"
-        chosen = PAPER_SETTINGS if own else options
+    for number, paper_settings in jobs:
+        run = out / "runs" / f"{CONFIGURATION}-{number}{'-paper' if paper_settings else ''}"
+        chosen = PAPER_SETTINGS if paper_settings else options
         result = registered(
-            case, CONFIGURATION, sets.places(number), run, start=start, options=chosen, known=known and not own
+            case,
+            CONFIGURATION,
+            sets.places(number),
+            run,
+            start=start,
+            options=chosen,
+            known=known and not paper_settings,
         )
         figures = out / f"evaluation-{run.name}"
         shape = evaluate_files(run, reference=case / f"{CONFIGURATION}_implant.stl", figures=figures).shape
-        assert shape is not None  # there is a reference
+        assert shape is not None  # a reference was given
         truth = read_json(case / "truth.json", "truth")["cfg"][0]
         before, after = (torch.tensor(truth[f"nodes_{state}_mm"]).double() for state in ("undeformed", "deformed"))
         nodes = float(bb_rmse(result.warp(before), after))
-        rows.append(_row(number, own, shape, nodes, result.status, seconds_of(run)))
+        rows.append(_row(number, paper_settings, shape, nodes, result.status, seconds_of(run)))
         write_json(out / f"{run.name}.json", {**shape.to_dict(), "nodes_rmse_mm": nodes})
-        print(f"{number} views{', paper' if own else ''}: nodes off by {nodes:.3f} mm; {result.status}", flush=True)
+        print(
+            f"{number} views{', paper' if paper_settings else ''}: nodes off by {nodes:.3f} mm; {result.status}",
+            flush=True,
+        )
     header = [
         "views",
         "settings",
@@ -82,11 +91,13 @@ def femoral_plate(out: Path, *, quick: bool = False, known: bool = True, paper: 
     return table
 
 
-def _row(number: int, own: bool, shape: ShapeEvaluation, nodes: float, status: str, seconds: float) -> list[str]:
+def _row(
+    number: int, paper_settings: bool, shape: ShapeEvaluation, nodes: float, status: str, seconds: float
+) -> list[str]:
     surface, near, floor = shape.surface_after, shape.nodes_after, shape.node_floor
     return [
         str(number),
-        "the paper's" if own else "default",
+        "the paper's" if paper_settings else "default",
         f"{nodes:.3f}",
         "-" if surface is None else f"{surface.mean_mm:.3f}",
         "-" if surface is None else f"{surface.rmse_mm:.3f}",
@@ -98,20 +109,20 @@ def _row(number: int, own: bool, shape: ShapeEvaluation, nodes: float, status: s
 
 
 def _reconstructions(content: Mapping[str, Any], out: Path, quick: bool) -> str:
-    """A table of regions, and ``slices.png`` beside it."""
+    """Reconstruct the scan by each method, draw `slices.png` and return the table of regions."""
     views = {"num_views": 50, "step": "4 deg", "phase": "92 deg", "binning": 4} if quick else {"binning": 2}
     scan = simulated(content, out / "scan", scanner={**views, "cols": 384})
-    run, more = out / "runs" / f"{CONFIGURATION}-3", _QUICK_RECONSTRUCTION if quick else {}
+    run, changes = out / "runs" / f"{CONFIGURATION}-3", _QUICK_RECONSTRUCTION if quick else {}
     volumes, numbers = {}, {}
     grid: VolumeGrid | None = None
     for name, method in _METHODS.items():
-        own = {key: value for key, value in more.items() if method != "fdk" or key == "spacing_mm"}
+        options = {key: value for key, value in changes.items() if method != "fdk" or key == "spacing_mm"}
         folder = out / "reconstructions" / method
-        path = reconstructed(scan, CONFIGURATION, folder, run=run, method=method, scatter="run", **own)
+        path = reconstructed(scan, CONFIGURATION, folder, run=run, method=method, scatter="run", **options)
         volumes[name], grid = read_volume(path)
         numbers[name] = read_json(folder / "metrics.json", "metrics")
         print(f"{name}: {numbers[name]['seconds']:.0f} s", flush=True)
-    assert grid is not None  # there are methods
+    assert grid is not None  # at least one method ran
     components = registered_components(run)
     metal = sum((component.fraction(grid) for component in components), torch.zeros(grid.shape))
     window = (0.0, 2 * float(numbers["FDK"]["water"]))
@@ -127,7 +138,7 @@ def _regions(
     grid: VolumeGrid,
     from_metal: torch.Tensor,
 ) -> str:
-    """Means and deviations of water and rods, HU against water, each against what its material has."""
+    """Table of errors of the mean, and standard deviations, of water and rods in HU; the truth is each material's."""
     limb, height = Recipe.of(content).limb, grid.points(dtype=torch.float64)[..., 2].abs() <= _WITHIN_MM
     assert limb.tissue is not None and limb.tissue.axis is not None and limb.tissue.radius is not None  # its recipe
     clear, near = from_metal > 2 * max(grid.spacing), from_metal <= max(_NEAR_MM, 3 * max(grid.spacing))
@@ -143,18 +154,18 @@ def _regions(
         "water near the metal": (bath & clear & near & height, "water"),
     } | regions
     rows = []
-    for name, (region, of) in regions.items():
-        found = []
+    for name, (region, substance) in regions.items():
+        cells = []
         for method, volume in volumes.items():
             water, energy = float(numbers[method]["water"]), numbers[method]["reference_kev"]
-            there = region_statistics(volume, region)
-            asked = float(material(of).attenuation((float(energy or _energy(water)),))[0])
-            found.append(f"{1000 * (there.mean - asked) / water:+.0f} ± {1000 * there.std / water:.0f}")
-        rows.append([name, *found])
+            statistics = region_statistics(volume, region)
+            expected = float(material(substance).attenuation((float(energy or _energy(water)),))[0])
+            cells.append(f"{1000 * (statistics.mean - expected) / water:+.0f} ± {1000 * statistics.std / water:.0f}")
+        rows.append([name, *cells])
     return markdown_table(["error of the mean, deviation (HU)", *volumes], rows)
 
 
 def _energy(water: float) -> float:
-    """The energy at which water attenuates so, keV."""
+    """Energy in keV at which water has the attenuation `water`."""
     energies = torch.arange(20.0, 120.0, 0.25, dtype=torch.float64, device="cpu")
     return float(energies[(material("water").attenuation(energies) - water).abs().argmin()])

@@ -1,4 +1,4 @@
-"""Experiment A: a tibia's plate under six loads, from twelve views and from three (Table 1 and Fig. 3)."""
+"""Experiment A: a tibial plate under six loads, from twelve and from three views (Table 1 and Fig. 3)."""
 
 from __future__ import annotations
 
@@ -33,25 +33,27 @@ from .experiment import (
 
 CAD, BENCH, PAPER = "CAD", "bench scan", "paper's settings"
 _QUICK_LOADS = ("cfg0", "cfg3")
-_NEAR_MM = 4.0  # of where a bead is expected: there it is looked for
+_NEAR_MM = 4.0  # search radius around the expected position of a bead
 _SCAN_VOXELS: dict[str, Any] = {"spacing_mm": 0.5, "size_mm": (40.0, 32.0, 196.0)}
 _BENCH_MM = (24.0, 14.0, 196.0)
 
 
 @dataclass(frozen=True)
 class LoadRow:
-    """One registration of the experiment; root mean square errors in mm.
+    """One registration of the experiment. All errors are root mean squares in mm.
 
     Attributes:
-        load_n: Axial force.
-        model: Of the implant: its CAD file, its bench scan, or the CAD file with the paper's own settings.
-        views: How many.
-        start: Of the beads where the registration started.
-        beads: Against where the simulation put them.
-        segmented: Against their segmentations in FDKs of the same scans; None where there are none.
-        nodes: Of the implant's nodes.
-        std: What the registration expects of them.
-        status, seconds: Of the run.
+        configuration: Name of the configuration.
+        load_n: Axial force, N.
+        model: Model of the implant: its CAD file, its bench scan, or the CAD file with the paper's settings.
+        views: Number of views.
+        start: Error of the beads at the start pose.
+        beads: Error of the beads against their simulated positions.
+        segmented: Error of the beads against their segmentations in FDK volumes of the same scans; None without FDK.
+        nodes: Error of the implant's nodes.
+        std: Error of the nodes expected by the registration.
+        status: Verdict of the run.
+        seconds: Duration of the run.
     """
 
     configuration: str
@@ -68,18 +70,19 @@ class LoadRow:
 
 
 def tibial_plate(out: Path, *, quick: bool = False, known: bool = True, paper: bool = False) -> str:
-    """The experiment's table; it, the figures and all that they are made of are left in a folder.
+    """Run the experiment, write all results and figures to a folder, and return its table.
 
-    Six loads are imaged by physics that the registration is not told, registered from the paper's twelve views and from
-    its three, and compared with the beads' true places and with their segmentations in FDKs of the same scans. The
-    largest load is registered with the implant out of a bench scan, too. What is there already is kept.
+    Six loads are simulated with an image formation other than the registration's model. Each is registered from the
+    paper's twelve views and from its three, and compared with the true positions of the beads and with their
+    segmentations in FDK volumes of the same scans. The largest load is also registered with an implant model from a
+    bench scan. Existing results are kept.
 
     Args:
-        out: Folder to make.
-        quick: Two loads, three views, binned, without FDKs and bench scan: two minutes.
-        known: Screws and spectrum are told.
-        paper: Register three views with the paper's own settings, too: plain path lengths, gradient correlation, CMA-ES
-            of 40 x 400 from two to ten groups of control points. Minutes for each load.
+        out: Output folder, created if missing.
+        quick: Two loads, three binned views, no FDK and no bench scan: takes two minutes.
+        known: Give screws and spectrum to the registration.
+        paper: Also register three views with the paper's settings: plain path lengths, gradient correlation, CMA-ES of
+            40 x 400 from two to ten groups of control points. Takes minutes for each load.
 
     Raises:
         FileExistsError: If the folder holds another experiment.
@@ -106,7 +109,7 @@ class _Study:
 
     @cached_property
     def content(self) -> dict[str, Any]:
-        """The recipe."""
+        """Content of the experiment's recipe."""
         content = packaged("tibial_plate")
         if self.quick:
             content["configurations"] = {name: content["configurations"][name] for name in _QUICK_LOADS}
@@ -114,42 +117,42 @@ class _Study:
 
     @cached_property
     def sets(self) -> ViewSets:
-        """The views that are registered."""
+        """Sets of views that are registered."""
         return ViewSets.of_paper(quick=self.quick)
 
     @cached_property
     def start(self) -> Path:
-        """File of the start pose."""
+        """Path of the start pose's file."""
         return start_of(self.out)
 
     @cached_property
     def case(self) -> Path:
-        """Images of the views that are registered."""
+        """Case folder with images of the registered views."""
         scanner = {"views": self.sets.imaged, "binning": 2 if self.quick else 1}
         return simulated(self.content, self.out / "views", scanner=scanner)
 
     @cached_property
     def scan(self) -> Path:
-        """Images of all views, binned."""
+        """Case folder with binned images of all views."""
         return simulated(self.content, self.out / "scan", scanner={"binning": 2})
 
     @cached_property
     def truth(self) -> dict[str, Mapping[str, Any]]:
-        """What the simulation knows of each configuration."""
+        """Ground truth of each configuration, by name."""
         return {entry["name"]: entry for entry in read_json(self.case / "truth.json", "truth")["cfg"]}
 
     @cached_property
     def beads(self) -> Tensor:
-        """Centres in the implant's frame, (B, 3)."""
+        """Centres of the beads in the implant's frame (B, 3), mm."""
         return _points(read_json(self.case / "truth.json", "truth")["bb_reference_mm"])
 
     @cached_property
     def bench(self) -> Path:
-        """The implant out of its bench scan."""
+        """Path of the implant model from its bench scan."""
         return bench_model(self.content["implant"], self.out / "bench", size_mm=_BENCH_MM)
 
     def jobs(self, paper: bool) -> Iterator[tuple[str, int, str]]:
-        """Configuration, number of views and model of each registration."""
+        """Yield configuration, number of views and implant model of each registration."""
         names = list(self.content["configurations"])
         for name in names:
             yield from ((name, number, CAD) for number in sorted(self.sets.views))
@@ -159,8 +162,8 @@ class _Study:
                 yield name, 3, PAPER
 
     def row(self, configuration: str, number: int, model: str) -> LoadRow:
-        """What a registration finds."""
-        own = model == PAPER
+        """Run one registration and return its errors."""
+        paper_settings = model == PAPER
         name = f"{configuration}-{number}" + {CAD: "", BENCH: "-bench", PAPER: "-paper"}[model]
         run = self.out / "runs" / name
         result = registered(
@@ -169,8 +172,8 @@ class _Study:
             self.sets.places(number),
             run,
             start=self.start,
-            options=PAPER_SETTINGS if own else {"material": self.content["implant"]["material"]},
-            known=self.known and not own,
+            options=PAPER_SETTINGS if paper_settings else {"material": self.content["implant"]["material"]},
+            known=self.known and not paper_settings,
             implant=self.bench if model == BENCH else None,
         )
         if model == CAD and number == 3:
@@ -193,25 +196,25 @@ class _Study:
         )
 
     def _segmented_error(self, configuration: str, result: RegistrationResult) -> float | None:
-        """As in the paper: beads of the unloaded scan's FDK, moved as registered, against those of the loaded one's."""
+        """Bead error as in the paper: beads of the unloaded scan, moved as registered, against the loaded scan's."""
         unloaded = next(iter(self.content["configurations"]))
         before = self._segmentation(unloaded, self.beads)
         after = self._segmentation(configuration, result.warp(before))
-        both = before.isfinite().all(1) & after.isfinite().all(1)
-        return float(bb_rmse(result.warp(before[both]), after[both])) if bool(both.any()) else None
+        in_both = before.isfinite().all(1) & after.isfinite().all(1)
+        return float(bb_rmse(result.warp(before[in_both]), after[in_both])) if bool(in_both.any()) else None
 
     def _segmentation(self, configuration: str, expected: Tensor) -> Tensor:
-        """Beads (B, 3) in the FDK of a scan, each the nearest to where it is expected; nan where none is near."""
+        """Beads (B, 3) in the FDK of a scan, each the nearest to its expected position; nan if none is near."""
         if configuration not in self.segmented:
             path = reconstructed(self.scan, configuration, self.out / "fdk" / configuration, **_SCAN_VOXELS)
             self.segmented[configuration] = find_beads(*read_volume(path)).centers
         distances = torch.cdist(expected, self.segmented[configuration])
-        nearest, which = distances.min(1)
-        return self.segmented[configuration][which].masked_fill((nearest > _NEAR_MM)[:, None], torch.nan)
+        nearest, index = distances.min(1)
+        return self.segmented[configuration][index].masked_fill((nearest > _NEAR_MM)[:, None], torch.nan)
 
 
 def load_table(rows: list[LoadRow]) -> str:
-    """Table 1 of the paper, as this experiment has it."""
+    """Table of all registrations, in the form of the paper's Table 1."""
     header = ["load", "views", "implant", "start", "BB, simulated", "BB, segmented", "nodes", "expected", "", "seconds"]
     listed = [
         [
