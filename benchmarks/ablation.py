@@ -22,14 +22,17 @@ from tqdm import tqdm
 from torchkcreg.evaluation import bb_rmse
 from torchkcreg.implant import find_holes
 from torchkcreg.registration import RegistrationConfig, Stage, preset_stages, register
-from torchkcreg.simulation import Load, SimulatedCase, weight_bearing_case
+from torchkcreg.simulation import SimulatedCase, weight_bearing_case
+from torchkcreg.simulation.bench import LoadRecipe
 from torchkcreg.studies.capture import registration_inputs
 
 CASES = {
     "axial load, 48 degrees": {"load": 1.0, "seed": 0, "views": (47, 48, 49)},
     "axial load, face on": {"load": 1.0, "seed": 1, "views": (91, 92, 93)},
     "S-bend, 48 degrees": {
-        "load": Load(s_bend_deg=6.0, torsion_deg=2.0, zone_mm=63.0, translation_mm=(0.6, -0.8, 0.5)),
+        "load": LoadRecipe.of(
+            {"s_bend": "6 deg", "torsion": "2 deg", "zone": "63 mm", "translation": "[0.6, -0.8, 0.5] mm"}
+        ),
         "seed": 3,
         "views": (47, 48, 49),
         "mode": "s_bend",

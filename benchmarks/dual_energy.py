@@ -20,7 +20,7 @@ from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
 from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import tungsten_spectrum
 from torchkcreg.reconstruction import Decomposition, decompose, unknown_share
-from torchkcreg.simulation import DetectorModel, Part, simulate_projections
+from torchkcreg.simulation import FlatPanel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import reconstruction_figure
 
@@ -52,8 +52,8 @@ def scan(bath: str) -> tuple[ConeBeamGeometry, torch.Tensor]:
     geometry = ConeBeamGeometry(circle.projection_matrices, circle.det_shape, circle.pixel_spacing, sources=sources)
     parts = [Part("bath", rod(0.0, 0.0, 34.0), bath), Part("plate", plate(), "titanium", inside="bath")]
     parts += [Part(name, rod(*place, 6.0), name, inside="bath") for name, place in RODS.items()]
-    detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16)
-    return geometry, simulate_projections(geometry, parts, SPECTRA, detector=detector).float() / detector.open_beam
+    panel = FlatPanel.ideal(photons=2e4, electronic_noise=2.0)
+    return geometry, simulate_projections(geometry, parts, SPECTRA, panel=panel).float() / panel.open_beam
 
 
 def rows(bath: str, decomposition: Decomposition, far: torch.Tensor) -> list[str]:

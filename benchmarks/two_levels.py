@@ -22,7 +22,7 @@ from torchkcreg.geometry import TwoLevelGrid, VolumeGrid, circular_geometry
 from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import material, tungsten_spectrum
 from torchkcreg.reconstruction import BeamModel, PWLSConfig, reconstruct, unknown_share
-from torchkcreg.simulation import DetectorModel, Part, simulate_projections
+from torchkcreg.simulation import FlatPanel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import reconstruction_figure
 
@@ -61,8 +61,8 @@ def parts() -> list[Part]:
 
 def solved(name: str, beta: float) -> tuple[torch.Tensor, VolumeGrid, float, float]:
     """Reconstructed volume, its grid (of a two-level grid, the fine one), seconds, and peak memory in GiB."""
-    detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16)
-    transmission = simulate_projections(GEOMETRY, parts(), SPECTRUM, detector=detector).float() / detector.open_beam
+    panel = FlatPanel.ideal(photons=2e4, electronic_noise=2.0)
+    transmission = simulate_projections(GEOMETRY, parts(), SPECTRUM, panel=panel).float() / panel.open_beam
     metal = [KnownComponent.from_mesh(plate(), "titanium", pitch=0.2)]
     beam = BeamModel.polyenergetic([material("titanium")], SPECTRUM)
     start, grid = time.perf_counter(), {"0.8 mm": COARSE, "0.267 mm": FINE}.get(name)

@@ -66,10 +66,10 @@ def value(name: str, what: str, conditions: list[str]) -> str:
         raise ValueError(f"{name}: {len(rows)} rows with {'; '.join(conditions)}, where one is wanted")
     if not rows or column not in rows[0]:
         raise ValueError(f"{name} has no {column!r} with {'; '.join(conditions)}")
-    if not form:
+    if not form and statistic is None:
         return rows[0][column]
     numbers = np.array([float(row[column]) for row in rows if row[column] not in ("", "nan")])
-    return format((statistic or (lambda all_of_one: all_of_one[0]))(numbers), form)
+    return format((statistic or (lambda all_of_one: all_of_one[0]))(numbers), form or "g")
 
 
 def filled(text: str) -> str:

@@ -112,7 +112,7 @@ REASONS = {
     "optimization/cmaes.py": "one optimiser, one file",
     "projector/voxel_ops.py": "operators stand beside their reference and their module",
     "similarity/similarity.py": "the interface of a user's own similarity",
-    "physics/detector.py": "the detector of a simulation",
+    "physics/detector.py": "the one conversion of counts to line integrals",
     "visualization/case.py": "one figure, one file",
     "visualization/comparison.py": "one figure, one file",
     "visualization/load.py": "one figure, one file",

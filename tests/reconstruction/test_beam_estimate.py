@@ -11,7 +11,7 @@ from torchkcreg.geometry import VolumeGrid, circular_geometry
 from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import Beam, material, tungsten_spectrum
 from torchkcreg.reconstruction import BeamModel, component_path_lengths, estimate_beam
-from torchkcreg.simulation import DetectorModel, Part, simulate_projections
+from torchkcreg.simulation import FlatPanel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 from torchkcreg.visualization import beam_figure
 
@@ -34,12 +34,12 @@ def component(name: str) -> KnownComponent:
 def scans() -> dict[tuple[str, float], torch.Tensor]:
     """Transmissions by the bar's alloy and the tube's voltage."""
     axis = torch.tensor([0.0, 0.0, 40.0])
-    detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16)
+    panel = FlatPanel.ideal(photons=2e4, electronic_noise=2.0)
     made = {}
     for alloy, kvp in (("titanium", 120.0), ("steel", 80.0)):
         parts = [Part("bar", bar(), alloy, inside="bath"), Part("bath", Cylinder(-axis, axis, 28.0), "water")]
-        images = simulate_projections(GEOMETRY, parts, tungsten_spectrum(kvp), detector=detector)
-        made[alloy, kvp] = images.float() / detector.open_beam
+        images = simulate_projections(GEOMETRY, parts, tungsten_spectrum(kvp), panel=panel)
+        made[alloy, kvp] = images.float() / panel.open_beam
     return made
 
 

@@ -11,7 +11,7 @@ from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, circular_geometry
 from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import tungsten_spectrum
 from torchkcreg.reconstruction import PWLSConfig, decompose
-from torchkcreg.simulation import DetectorModel, Part, simulate_projections
+from torchkcreg.simulation import FlatPanel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 
 VIEWS = 90
@@ -40,8 +40,8 @@ def scan() -> tuple[ConeBeamGeometry, torch.Tensor]:
     geometry = ConeBeamGeometry(circle.projection_matrices, circle.det_shape, circle.pixel_spacing, sources=sources)
     parts = [Part("bath", rod(0.0, 0.0, 34.0), "water"), Part("plate", plate(), "titanium", inside="bath")]
     parts += [Part(name, rod(*place, 6.0), name, inside="bath") for name, place in RODS.items()]
-    detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16)
-    return geometry, simulate_projections(geometry, parts, SPECTRA, detector=detector).float() / detector.open_beam
+    panel = FlatPanel.ideal(photons=2e4, electronic_noise=2.0)
+    return geometry, simulate_projections(geometry, parts, SPECTRA, panel=panel).float() / panel.open_beam
 
 
 def test_rods_are_recovered_beside_a_plate(scan):
@@ -63,9 +63,9 @@ def test_tissue_lighter_than_water_is_no_lack_of_calcium(scan):
     """One voltage cannot tell light tissue from less calcium; two can."""
     geometry, _ = scan
     bath = Part("bath", rod(0.0, 0.0, 30.0), "adipose_tissue")
-    detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16).without_noise()
-    images = simulate_projections(geometry, [bath], SPECTRA, detector=detector).float()
-    found = decompose(images / detector.open_beam, geometry, GRID, SPECTRA, config=PWLSConfig(iterations=20, subsets=5))
+    panel = FlatPanel.ideal()
+    images = simulate_projections(geometry, [bath], SPECTRA, panel=panel).float()
+    found = decompose(images / panel.open_beam, geometry, GRID, SPECTRA, config=PWLSConfig(iterations=20, subsets=5))
     inside = cylinder_region(GRID, (0, 0, -9), (0, 0, 9), 20.0)
     both = region_statistics(found.calcium_mg_ml, inside).mean
     alone = region_statistics(found.single_mg_ml, inside).mean

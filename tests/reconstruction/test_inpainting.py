@@ -8,7 +8,7 @@ from torchkcreg.geometry import VolumeGrid, circular_geometry
 from torchkcreg.implant import KnownComponent
 from torchkcreg.physics import tungsten_spectrum
 from torchkcreg.reconstruction import BeamModel, component_path_lengths, fdk, inpainted, prepare
-from torchkcreg.simulation import DetectorModel, Part, simulate_projections
+from torchkcreg.simulation import FlatPanel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 
 PANEL = {"sad": 404, "sdd": 538, "det_shape": (24, 56), "pixel_spacing": (2.0, 2.0)}
@@ -25,9 +25,9 @@ def volumes():
     bar.apply_translation((6.0, 4.0, 0.0))
     water = Part("bath", Cylinder(-axis, axis, 28.0), "water")
     plate = Part("bar", bar, "steel", inside="bath")
-    detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16).without_noise()
+    panel = FlatPanel.ideal()
     with_bar, without = (
-        simulate_projections(geometry, parts, SPECTRUM, detector=detector).float() / detector.open_beam
+        simulate_projections(geometry, parts, SPECTRUM, panel=panel).float() / panel.open_beam
         for parts in ([plate, water], [water])
     )
     beam = BeamModel.polyenergetic([], SPECTRUM)

@@ -16,7 +16,7 @@ from torchkcreg.reconstruction import (
     unknown_share,
     with_components,
 )
-from torchkcreg.simulation import DetectorModel, Part, simulate_projections
+from torchkcreg.simulation import FlatPanel, Part, simulate_projections
 from torchkcreg.simulation.solids import Cylinder
 
 PANEL = {"sad": 404, "sdd": 538, "det_shape": (24, 56), "pixel_spacing": (2.0, 2.0)}
@@ -37,9 +37,9 @@ def scan():
     axis = torch.tensor([0.0, 0.0, 60.0])
     water = Part("bath", Cylinder(-axis, axis, 28.0), "water")
     plate = Part("bar", bar(), "titanium", inside="bath")
-    detector = DetectorModel(scatter_fraction=0.0, psf_sigma_mm=0.0, open_beam=60000.0, bits=16).without_noise()
+    panel = FlatPanel.ideal()
     images = [
-        simulate_projections(geometry, parts, SPECTRUM, detector=detector).float() / detector.open_beam
+        simulate_projections(geometry, parts, SPECTRUM, panel=panel).float() / panel.open_beam
         for parts in ([plate, water], [water])
     ]
     return geometry, *images

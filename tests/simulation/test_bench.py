@@ -309,7 +309,7 @@ def test_simulator_and_registration_share_neither_projector_nor_scatter_nor_blur
     def never(*_args, **_options):
         raise AssertionError("the registration's own model")
 
-    monkeypatch.setattr("torchkcreg.simulation.scanner.gaussian_blur", never)
-    monkeypatch.setattr("torchkcreg.simulation.scanner.convolve", never)
-    monkeypatch.setattr("torchkcreg.simulation.scanner.gaussian_kernel", never)
+    monkeypatch.setattr("torchkcreg.physics.blur.gaussian_blur", never)
+    monkeypatch.setattr("torchkcreg.physics.blur.convolve", never)
+    monkeypatch.setattr("torchkcreg.physics.blur.gaussian_kernel", never)
     assert len(only(small(limb={"bone": {}})).counts) == 1

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchkcreg.physics import PolyenergeticTransmission, line_integrals_from_intensity, material
+from torchkcreg.physics import PolyenergeticTransmission, material
 from torchkcreg.projector.mesh import project_mesh
-from torchkcreg.simulation import DetectorModel, Load, weight_bearing_case
+from torchkcreg.simulation import weight_bearing_case
+from torchkcreg.simulation.bench import LoadRecipe, PanelRecipe
 
 SMALL = {"views": [48], "binning": 8}
-CLEAN = DetectorModel().without_noise()
+CLEAN = {"panel": PanelRecipe(noise=False), "scatter_to_primary": 0.1}
 
 
 def plate_shadow(case, vertices: torch.Tensor) -> torch.Tensor:
@@ -28,9 +29,10 @@ def test_without_a_load_nothing_moves():
 
 
 def test_the_image_shows_the_plate_where_the_truth_has_it():
-    case = weight_bearing_case(1.5, detector=CLEAN, **SMALL)
-    measured, valid = line_integrals_from_intensity(case.intensity, case.open_beam, saturation=case.saturation)
-    assert valid.all()
+    case = weight_bearing_case(1.5, **CLEAN, **SMALL)
+    data = case.data()
+    assert data.mask.all()
+    measured = data.line_integrals
     before = torch.tensor(np.asarray(case.implant.vertices))
     errors = []
     for vertices in (before, case.deform(before)):
@@ -45,7 +47,7 @@ def test_loads_move_beads_and_plate_by_millimetres():
     moved = (case.beads_after - case.beads_before).norm(dim=1)
     assert float(moved.min()) > 0.5
     assert float(moved.max()) < 5
-    torch.testing.assert_close(case.deform(case.beads_before), case.beads_after)
+    torch.testing.assert_close(case.deform(case.beads_before), case.beads_after, rtol=0, atol=1e-3)
 
 
 def test_the_seed_decides_misalignment_and_noise():
@@ -57,18 +59,18 @@ def test_the_seed_decides_misalignment_and_noise():
 def test_the_s_bend_has_four_screws_and_parallel_ends():
     case = weight_bearing_case(1.0, mode="s_bend", **SMALL)
     assert len(case.screws) == 4
-    assert case.load.s_bend_deg == 3.0
-    assert case.load.zone_mm == 63.0
+    assert case.load.s_bend == 3.0
+    assert case.load.zone == 63.0
 
 
 def test_a_load_of_ones_own_is_taken_as_it_is():
-    load = Load(torsion_deg=2.0)
+    load = LoadRecipe.of({"torsion": "2 deg"})
     assert weight_bearing_case(load, **SMALL).load is load
 
 
 def test_soft_tissue_darkens_the_background_only():
-    bare = weight_bearing_case(0.0, detector=CLEAN, **SMALL)
-    covered = weight_bearing_case(0.0, detector=CLEAN, tissue_radius_mm=40.0, **SMALL)
+    bare = weight_bearing_case(0.0, **{**CLEAN, "scatter_to_primary": 0.0}, **SMALL)
+    covered = weight_bearing_case(0.0, **{**CLEAN, "scatter_to_primary": 0.0}, tissue_radius_mm=40.0, **SMALL)
     assert (covered.intensity.int() <= bare.intensity.int()).all()
     paths = {part.name for part in covered.parts} - {part.name for part in bare.parts}
     assert paths == {"tissue"}

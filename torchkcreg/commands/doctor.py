@@ -11,12 +11,9 @@ import torch
 
 from torchkcreg.evaluation import bb_rmse
 from torchkcreg.geometry import VolumeGrid, circular_geometry
-from torchkcreg.implant import Component, ImplantPointCloud
-from torchkcreg.physics import line_integrals_from_intensity
 from torchkcreg.projector import backproject, project_points, project_volume
 from torchkcreg.reconstruction import fdk
 from torchkcreg.registration import RegistrationConfig, register
-from torchkcreg.scene import RegistrationData
 from torchkcreg.simulation import weight_bearing_case
 
 from .info import describe_installation, kernels_in_words
@@ -126,8 +123,6 @@ def _fdk() -> tuple[bool, str]:
 def _registration() -> tuple[bool, str]:
     start = time.perf_counter()
     case = weight_bearing_case(0.5, binning=4)
-    data = RegistrationData(case.geometry, *line_integrals_from_intensity(case.intensity.float(), case.open_beam))
-    implant, screws = ImplantPointCloud.from_mesh(case.implant, pitch=0.5), [Component.of(s) for s in case.screws]
-    result = register(implant, data, RegistrationConfig(material="steel"), components=screws)
+    result = register(case.cloud(0.5), case.data(), RegistrationConfig(material="steel"), components=case.screws)
     error = bb_rmse(result.warp(case.beads_before), case.beads_after)
     return bool(error < ROUGH_MM), f"{error:.3f} mm off, {time.perf_counter() - start:.0f} s"

@@ -116,7 +116,7 @@ def register(
 
     Args:
         implants: Undeformed implant in its own frame; or several, each an `Implant` with its components.
-        data: Projections, masks and geometry.
+        data: Measured line integrals with their masks and geometry.
         config: Options; the defaults when None.
         spectrum: Detected spectrum; a 90 kV tungsten spectrum when None.
         components: Components of a single implant, see `Implant`.
@@ -124,11 +124,13 @@ def register(
         holes: Holes of a single implant.
         deformation: Makes the deformation of `(implant, config)`: by default as the options say.
         intensity: Model in place of the options' model, see `build_scene`.
-        similarity: Makes the data term of `(fixed, mask, weights)`, in place of the stages'.
-        penalties: Functions of the K candidates of a `torchkcreg.scene.State` to (K,), beside the priors.
+        similarity: Makes the similarity of `(fixed, mask, weights)`, in place of those that the stages name.
+        penalties: Each takes a `torchkcreg.scene.State` of K candidates and returns K penalties (K,), added to the
+            priors.
         optimizer: Makes the optimiser of `(problem, stage, seed)`, in place of the stages'.
         steps: Additional steps, by the names used in stages.
-        start: Earlier registration of the same implants, whose poses and intensity parameters are the start.
+        start: Earlier registration of the same implants. Its poses and intensity parameters are the start; its
+            deformations are not taken over.
         callbacks: See `torchkcreg.registration.Callback`.
         seconds: Time limit; after it the registration ends with the current iteration and the result says so.
 

@@ -25,6 +25,8 @@ class Scene(nn.Module):
     Calling it with a geometry gives the line integrals of the geometry's views, differentiable in all parameters of the
     scene.
 
+    A candidate is one set of trial poses, deformations and parameters; K of them are rendered in one batch.
+
     Args:
         assemblies: One implant or several, each with what is fixed to it.
         intensity: Maps path lengths of the materials, in the order of `materials`, to line integrals.

@@ -3,19 +3,18 @@
 `weight_bearing_case` returns images of a loaded plate together with its true deformation.
 """
 
+from .bench import FlatPanel, simulate_projections
 from .cases import SimulatedCase, weight_bearing_case
-from .draws import Draw, draw_case
 from .hardware import hole_positions, locking_plate, locking_screws
 from .loads import Load, RodMotion
 from .parts import Part, material_paths
-from .population import random_case
-from .scanner import DetectorModel, simulate_projections
+from .population import Draw, draw_case, random_case
 from .solids import Cylinder, Sphere, Tube, chord_image, chord_lengths
 
 __all__ = [
     "Cylinder",
-    "DetectorModel",
     "Draw",
+    "FlatPanel",
     "Load",
     "Part",
     "RodMotion",

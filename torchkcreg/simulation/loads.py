@@ -27,13 +27,14 @@ class Load:
         lateral_deg: Angle between the two ends about y: it bends in its plane.
         torsion_deg: Angle between the two ends about z.
         s_bend_deg: Angle of each of the S-bend's two opposite bends about x.
-        zone_mm: The humps lie within -zone to zone along z: half the distance of the inner screws.
+        zone_mm: The humps lie within this distance of `center_mm` along z: half the distance of the inner screws.
+        center_mm: Height z of the middle of the bent stretch.
         length_mm: Length of the plate, centred on z = 0.
         rotation_deg: Rotation vector of the misalignment of the whole plate, degrees.
         translation_mm: Translation of the misalignment, mm.
 
     Raises:
-        ValueError: If the zone is not positive or longer than the plate.
+        ValueError: If the zone is not positive or longer than the plate, or does not contain z = 0.
 
     >>> bent = Load(bend_deg=3.0).motion()(torch.tensor([[0.0, 0.0, -94.0], [0.0, 0.0, 0.0], [0.0, 0.0, 94.0]]))
     >>> [round(y, 2) for y in bent[:, 1].tolist()]
@@ -45,6 +46,7 @@ class Load:
     torsion_deg: float = 0.0
     s_bend_deg: float = 0.0
     zone_mm: float = 27.0
+    center_mm: float = 0.0
     length_mm: float = 188.0
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     translation_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -52,12 +54,14 @@ class Load:
     def __post_init__(self) -> None:
         if not 0 < 2 * self.zone_mm <= self.length_mm:
             raise ValueError(f"zone_mm must lie between 0 and half of {self.length_mm} mm, got {self.zone_mm}")
+        if not abs(self.center_mm) < self.zone_mm:
+            raise ValueError(f"center_mm must lie within {self.zone_mm} mm of 0, got {self.center_mm}")
 
     def motion(self) -> RodMotion:
         """Motion of points of the undeformed frame under this load."""
 
         def curvature(z: Tensor) -> Tensor:
-            relative = (z / self.zone_mm).clamp(-1, 1)
+            relative = ((z - self.center_mm) / self.zone_mm).clamp(-1, 1)
             hump = (1 + torch.cos(math.pi * relative)) / (2 * self.zone_mm)  # integral one
             wave = -math.pi / (2 * self.zone_mm) * torch.sin(math.pi * relative)  # integral 1, then -1
             bend, lateral, torsion, s_bend = (
@@ -67,7 +71,7 @@ class Load:
 
         rotation = torch.deg2rad(torch.tensor(self.rotation_deg, dtype=torch.float64))
         misalignment = rigid_matrix(rotation, torch.tensor(self.translation_mm, dtype=torch.float64))
-        stretch = (-self.zone_mm, self.zone_mm)
+        stretch = (self.center_mm - self.zone_mm, self.center_mm + self.zone_mm)
         plate = torch.cartesian_prod(
             *(torch.linspace(-x, x, n).double() for x, n in zip(self._half_size(), (2, 2, 65)))
         )

@@ -1,32 +1,171 @@
-"""Random weight-bearing cases with clinically varied plates, screws, limbs, spectra, scanners and loads."""
+"""Random weight-bearing cases: clinically varied plates, screws, limbs, spectra, scanners and loads, as recipes."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 
-from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner, fit_rigid, rigid_matrix
+from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
 from torchkcreg.implant import Screw
+from torchkcreg.mechanics import von_mises
 from torchkcreg.physics import tungsten_spectrum
 
-from .cases import BEAD_RADIUS, FRAGMENTS, GAP, SimulatedCase, fragment_at
-from .draws import Draw, draw_case
-from .elastic import ElasticMotion, Fragments, elastic_motion
-from .hardware import flared, locking_plate, mapped
-from .loads import Load, RodMotion
-from .parts import Part
-from .scanner import simulate_projections
-from .solids import Cylinder, Sphere, Tube
+from .bench.loaded import ElasticConstruct
+from .bench.quantities import quantity
+from .bench.recipe import LoadRecipe, PanelRecipe, Recipe
+from .bench.specimen import Specimen, parametric_plate, specimen
+from .cases import SimulatedCase
+from .hardware import hole_positions
+from .loads import RodMotion
 
-PlateMotion = RodMotion | ElasticMotion
+_KILOVOLTS = (70, 80, 90, 100, 110, 120)
+_GAP_MM = 4.0
+_TO_BONE_MM = 1.5  # distance between plate and bone
+_STRESSED = (0.2, 0.8)  # range of an elastic plate's highest stress, as a share of the yield stress
+_HIGHEST = 0.98  # quantile taken as the highest stress
 ViewSet = Literal["neighbours", "around", "both", "spread", "many"]
-_SOFTENING_MM = 4.0  # length over which the plate's curvature rises from zero next to a holding screw
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Parameters drawn for a case; lengths in mm, angles in degrees.
+
+    Attributes:
+        seed: Seed of the draw.
+        material, screw_material: Materials of plate and screws.
+        num_holes, pitch, width, thickness: Size of the plate; `pitch` is the distance between holes.
+        hole_offset: 0 for round holes, else half the distance between the two circles of a combination hole.
+        flare: Width of the plate's upper end divided by the width of its shaft.
+        bow_deg, twist_deg: Contouring of the undeformed plate: bending and torsion angle between its ends.
+        holes_used: Indices of the holes with screws.
+        loose: Index, within `holes_used`, of a screw that is loose in its bone; None if all hold.
+        tilt_deg: Largest angle between a screw and its hole's axis.
+        heads: True if the screws have heads above the plate, which are imaged but not in the list of screws.
+        bend_deg, s_bend_deg, torsion_deg, lateral_deg: Load: angles between the innermost screws that hold.
+        turn_deg, shift: Misalignment of the whole plate: rotation and translation vector.
+        scanner: "extremity" or "c-arm".
+        azimuth_deg: Gantry angle of the first of three neighbouring views; the plate is seen face on at 90.
+        kvp: Tube voltage.
+        water_radius: Radius of the water cylinder (the limb) around the bone's axis; 0: a bare bone.
+        bone_radius, cortex: Outer radius and wall thickness of the hollow bone.
+        marrow: True if cancellous bone fills the hollow bone.
+        focal_spot: Width of the focal spot, mm.
+        panel: The detector.
+        scatter_to_primary: Mean scatter over mean primary in the object's shadow.
+    """
+
+    seed: int
+    material: str
+    screw_material: str
+    num_holes: int
+    pitch: float
+    width: float
+    thickness: float
+    hole_offset: float
+    flare: float
+    bow_deg: float
+    twist_deg: float
+    holes_used: tuple[int, ...]
+    loose: int | None
+    tilt_deg: float
+    heads: bool
+    bend_deg: float
+    s_bend_deg: float
+    torsion_deg: float
+    lateral_deg: float
+    turn_deg: tuple[float, float, float]
+    shift: tuple[float, float, float]
+    scanner: Literal["extremity", "c-arm"]
+    azimuth_deg: float
+    kvp: int
+    water_radius: float
+    bone_radius: float
+    cortex: float
+    marrow: bool
+    focal_spot: float
+    panel: PanelRecipe
+    scatter_to_primary: float
+
+    @property
+    def length(self) -> float:
+        """Length of the plate, mm."""
+        return self.num_holes * self.pitch + 8.0
+
+    @property
+    def hole_heights(self) -> list[float]:
+        """Heights of the holes on the straight plate, mm."""
+        return hole_positions(length=self.length, num_holes=self.num_holes)
+
+
+def draw_case(seed: int) -> Draw:
+    """Draw the parameters of a case. All choices are independent, in realistic ranges of plates, limbs and scanners.
+
+    >>> draw_case(3) == draw_case(3), draw_case(3) == draw_case(4)
+    (True, False)
+    """
+    rng = np.random.default_rng([seed, 20])
+    num_holes = int(rng.integers(6, 11))
+    lower = num_holes // 2  # the gap lies between two holes
+    inner = 1 if rng.random() < 0.5 else 0
+    sides = []
+    for holes in (range(lower - 1 - inner, -1, -1), range(lower + inner, num_holes)):
+        count = min(len(holes), int(rng.integers(2, 4)))
+        rest = sorted(rng.choice(np.array(holes[1:]), count - 1, replace=False).tolist())
+        sides.append([holes[0], *rest])
+    used = tuple(sorted(int(h) for side in sides for h in side))
+    material = "steel" if rng.random() < 0.5 else "titanium"
+    other_material = {"steel": "titanium", "titanium": "steel"}[material]
+    combination = rng.random() < 0.5
+    pre_bent = rng.random() < 0.5
+    kind = rng.choice(["plain", "s", "loose"], p=[0.5, 0.3, 0.2])
+    directions = rng.normal(size=(2, 3))
+    turn, shift = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    bare = rng.random() < 0.2
+    innermost = [index for index, hole in enumerate(used) if hole in (sides[0][0], sides[1][0])]
+    return Draw(
+        seed=seed,
+        material=material,
+        screw_material=material if rng.random() < 0.65 else other_material,
+        num_holes=num_holes,
+        pitch=float(rng.uniform(14.5, 18.5)),
+        width=float(rng.uniform(11.0, 14.0)),
+        thickness=float(rng.uniform(2.8, 4.6)),
+        hole_offset=float(rng.uniform(1.2, 1.8)) if combination else 0.0,
+        flare=float(rng.uniform(1.2, 1.8)) if pre_bent and rng.random() < 0.5 else 1.0,
+        bow_deg=float(rng.uniform(-8.0, 8.0)) if pre_bent else 0.0,
+        twist_deg=float(rng.uniform(-8.0, 8.0)) if pre_bent else 0.0,
+        holes_used=used,
+        loose=int(rng.choice(innermost)) if kind == "loose" and min(len(s) for s in sides) > 1 else None,
+        tilt_deg=float(rng.uniform(3.0, 8.0)) if rng.random() < 0.5 else 0.0,
+        heads=bool(rng.random() < 0.3),
+        bend_deg=float(rng.uniform(-2.4, 2.4)) * (0.3 if kind == "s" else 1.0),
+        s_bend_deg=float(rng.uniform(0.8, 2.4)) if kind == "s" else 0.0,
+        torsion_deg=float(rng.uniform(-1.5, 1.5)),
+        lateral_deg=float(rng.uniform(-0.3, 0.3)),
+        turn_deg=tuple((float(rng.uniform(0.2, 1.5)) * turn).tolist()),
+        shift=tuple((float(rng.uniform(0.2, 2.0)) * shift).tolist()),
+        scanner="extremity" if rng.random() < 0.7 else "c-arm",
+        azimuth_deg=round(float(rng.uniform(0.0, 180.0)), 1),
+        kvp=int(rng.choice(_KILOVOLTS)),
+        water_radius=0.0 if bare else float(rng.uniform(40.0, 52.0)),
+        bone_radius=float(rng.uniform(10.0, 14.0)),
+        cortex=float(rng.uniform(3.0, 6.0)),
+        marrow=bool(rng.random() < 0.5),
+        focal_spot=float(rng.uniform(0.2, 0.6)),
+        panel=PanelRecipe(
+            half_contrast_lp_mm=float(rng.uniform(1.2, 2.4)),
+            glare=float(rng.uniform(0.0, 0.12)),
+            open_beam=float(rng.uniform(2400.0, 3600.0)),
+            photons=float(np.exp(rng.uniform(math.log(8e3), math.log(6e4)))),
+            electronic_noise=float(rng.uniform(1.0, 4.0)),
+        ),
+        scatter_to_primary=float(rng.uniform(0.1, 0.8)),
+    )
 
 
 def random_case(
@@ -38,49 +177,62 @@ def random_case(
         seed: Seed of the case, or its drawn parameters, which may have been changed.
         views: "neighbours": three neighbouring views, one for each focal spot; "around": six around the limb; "both":
             these nine, in this order; "spread": three around the limb; "many": 24 around the limb.
-        elastic: The plate bends by finite elements under loads at its screws, which are then known. Otherwise it bends
-            as a rod with a drawn curvature.
+        elastic: A force on the upper fragment bends the plate by finite elements; the load that it carries is then
+            known. Otherwise the plate bends by the drawn angles.
         counts: Cached images of the case: simulating them takes seconds.
     """
     draw = seed if isinstance(seed, Draw) else draw_case(seed)
-    rest, loaded = motions(draw)
-    straight, carried = _straight_plate(draw), None
+    phantom, construct = random_specimen(draw), None
     if elastic:
-        rng = np.random.default_rng([draw.seed, 22])
-        pose = _misalignment(draw)
-        loaded, carried = elastic_motion(rest, mapped(straight, rest), draw.material, _fragments(draw), pose, rng)
+        construct = ElasticConstruct(phantom)
+        load = _force(draw, construct)
+        phantom = replace(phantom, recipe=phantom.recipe.model_copy(update={"configurations": {"loaded": load}}))
+        construct.specimen = phantom
+    geometry, spectrum = view_geometry(draw, views), tungsten_spectrum(draw.kvp)
+    return SimulatedCase.of(phantom, geometry, spectrum, construct=construct, counts=counts)
 
-    def deform(points: Tensor) -> Tensor:
-        return loaded(rest.straightened(points)).to(points.dtype)
 
-    listed, in_beam = _screws(draw, rest, loaded)
-    beads = _bead_positions(draw)
-    parts = [Part("plate", mapped(straight, loaded), draw.material, inside=_tissue(draw)), *in_beam]
-    parts += _limb(draw, loaded)
-    parts += [
-        Part(f"bead{n}", Sphere(center, BEAD_RADIUS), "steel", inside=_tissue(draw))
-        for n, center in enumerate(loaded(beads))
-    ]
-    geometry = view_geometry(draw, views)
-    spectrum = tungsten_spectrum(draw.kvp)
-    if counts is None:
-        counts = simulate_projections(geometry, parts, spectrum, detector=draw.detector, seed=draw.seed)
-    return SimulatedCase(
-        geometry=geometry,
-        implant=mapped(straight, rest),
-        implant_material=draw.material,
-        screws=listed,
-        beads_before=rest(beads),
-        beads_after=loaded(beads),
-        deform=deform,
-        intensity=counts,
-        open_beam=draw.detector.open_beam,
-        saturation=draw.detector.saturation,
-        spectrum=spectrum,
-        load=Load(bend_deg=draw.bend_deg, s_bend_deg=draw.s_bend_deg, torsion_deg=draw.torsion_deg),
-        parts=parts,
-        carried=carried,
+def random_specimen(draw: Draw) -> Specimen:
+    """The specimen of drawn parameters, with a recipe that bends the plate by the drawn angles."""
+    depth = -(draw.thickness / 2 + _TO_BONE_MM + draw.bone_radius)
+    plate = {
+        "length": quantity(draw.length, "mm"),
+        "width": quantity(draw.width, "mm"),
+        "thickness": quantity(draw.thickness, "mm"),
+        "holes": draw.num_holes,
+        "hole_offset": quantity(draw.hole_offset, "mm"),
+        "bow": quantity(draw.bow_deg, "deg"),
+        "twist": quantity(draw.twist_deg, "deg"),
+        "flare": draw.flare,
+    }
+    bone = {
+        "axis": quantity((0.0, depth, 0.0), "mm"),
+        "outer_radius": quantity(draw.bone_radius, "mm"),
+        "inner_radius": quantity(draw.bone_radius - draw.cortex, "mm"),
+        "gap": quantity(_GAP_MM, "mm"),
+        "reach": "160 mm",
+        "marrow": "cancellous_bone" if draw.marrow else None,
+    }
+    water = {"radius": quantity(draw.water_radius, "mm"), "half_length": "170 mm", "material": "water"}
+    beads = [quantity(bead, "mm") for bead in _beads(draw).tolist()]
+    recipe = Recipe.of(
+        {
+            "implant": {"plate": plate, "material": draw.material},
+            "screws": {
+                "material": draw.screw_material,
+                "heads": {} if draw.heads else None,
+                "loose": () if draw.loose is None else (draw.loose,),
+            },
+            "limb": {"bone": bone, "tissue": water if draw.water_radius else None, "beads": beads},
+            "configurations": {"loaded": _angles(draw)},
+            "tube": {"voltage": quantity(draw.kvp, "kV"), "focal_spot": quantity(draw.focal_spot, "mm")},
+            "panel": draw.panel,
+            "scatter_to_primary": draw.scatter_to_primary,
+            "seed": draw.seed,
+        }
     )
+    assert recipe.implant.plate is not None  # as above
+    return specimen(recipe, implant=parametric_plate(recipe.implant.plate), screws=_screws(draw))
 
 
 def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
@@ -113,117 +265,77 @@ def view_geometry(draw: Draw, views: ViewSet) -> ConeBeamGeometry:
     return joined.crop(slice(32, scanner.det_shape[0] - 32), slice(first_col, first_col + cols))
 
 
-def motions(draw: Draw) -> tuple[RodMotion, PlateMotion]:
-    """Motions from the straight plate to the undeformed (contoured) plate and to the loaded plate."""
-    half = draw.length / 2
-    bow = torch.deg2rad(torch.tensor([draw.bow_deg, 0.0, draw.twist_deg], dtype=torch.float64)) / draw.length
-    held = [z for i, z in enumerate(draw.hole_heights[hole] for hole in draw.holes_used) if i != draw.loose]
-    low, high = max(z for z in held if z < 0), min(z for z in held if z > 0)
-    middle, reach = (low + high) / 2, (high - low) / 2
-
-    def loaded(z: Tensor) -> Tensor:
-        relative = (z - middle) / reach
-        inside = ((reach - (z - middle).abs()) / _SOFTENING_MM).clamp(0, 1) / (2 * reach - _SOFTENING_MM)
-        angles = (draw.bend_deg, draw.lateral_deg, draw.torsion_deg)
-        bend, lateral, torsion = (math.radians(angle) * inside for angle in angles)
-        bend = bend - 4 * math.radians(draw.s_bend_deg) * relative * inside
-        return torch.stack([bend, lateral, torsion], dim=-1) + bow
-
-    stretch = (-half, half)
-    rest = RodMotion(lambda z: bow.expand(len(z), 3), stretch)
-    nodes = torch.cartesian_prod(*(torch.linspace(-x, x, n).double() for x, n in zip((6.0, 2.0, half), (2, 2, 65))))
-    common = fit_rigid(rest(nodes), RodMotion(loaded, stretch)(nodes))
-    return rest, RodMotion(loaded, stretch, _misalignment(draw) @ torch.linalg.inv(common))
+def _contour(draw: Draw) -> RodMotion:
+    """Motion from the straight plate to the undeformed (contoured) one."""
+    rates = torch.deg2rad(torch.tensor([draw.bow_deg, 0.0, draw.twist_deg], dtype=torch.float64)) / draw.length
+    return RodMotion(lambda z: rates.expand(len(z), 3), (-draw.length / 2, draw.length / 2))
 
 
-def _misalignment(draw: Draw) -> Tensor:
-    turn = torch.deg2rad(torch.tensor(draw.turn_deg, dtype=torch.float64))
-    return rigid_matrix(turn, torch.tensor(draw.shift, dtype=torch.float64))
+def _held(draw: Draw) -> list[float]:
+    """Heights of the screws that hold, mm."""
+    return [draw.hole_heights[hole] for number, hole in enumerate(draw.holes_used) if number != draw.loose]
 
 
-def _fragments(draw: Draw) -> Fragments:
-    """The two bone fragments and the holding screws. The S-bend is a relative shift of the fragments."""
-    heights = [draw.hole_heights[hole] for index, hole in enumerate(draw.holes_used) if index != draw.loose]
-    arm = min(z for z in heights if z > 0) - max(z for z in heights if z < 0)
-    shift = (0.0, math.radians(draw.s_bend_deg) * arm / 4, 0.0)
-    return Fragments(heights, (draw.bend_deg, draw.lateral_deg, draw.torsion_deg), shift)
-
-
-def _straight_plate(draw: Draw) -> trimesh.Trimesh:
-    plate = locking_plate(
-        length=draw.length,
-        width=draw.width,
-        thickness=draw.thickness,
-        num_holes=draw.num_holes,
-        hole_radius=2.4,
-        hole_offset=draw.hole_offset,
-        max_edge=2.0,
+def _angles(draw: Draw) -> LoadRecipe:
+    """Bending between the innermost screws that hold, and the misalignment."""
+    low, high = max(z for z in _held(draw) if z < 0), min(z for z in _held(draw) if z > 0)
+    angles = {
+        "bend": draw.bend_deg,
+        "lateral": draw.lateral_deg,
+        "torsion": draw.torsion_deg,
+        "s_bend": draw.s_bend_deg,
+    }
+    return LoadRecipe.of(
+        {
+            **{name: quantity(angle, "deg") for name, angle in angles.items()},
+            "zone": quantity((high - low) / 2, "mm"),
+            "center": quantity((low + high) / 2, "mm"),
+            **_misalignment(draw),
+        }
     )
-    return flared(plate, draw.length, draw.flare)
 
 
-def _screws(draw: Draw, rest: RodMotion, loaded: PlateMotion) -> tuple[list[Screw], list[Part]]:
-    """List of the screws without load, and their loaded parts in the beam, with heads that are not in the list."""
+def _misalignment(draw: Draw) -> dict[str, str]:
+    return {"rotation": quantity(draw.turn_deg, "deg"), "translation": quantity(draw.shift, "mm")}
+
+
+def _force(draw: Draw, construct: ElasticConstruct) -> LoadRecipe:
+    """A force on the upper fragment, mostly along the bone, that stresses the plate to a random share of its yield."""
+    rng = np.random.default_rng([draw.seed, 22])
+    depth = -(draw.thickness / 2 + _TO_BONE_MM + draw.bone_radius)
+    direction = np.array([*rng.normal(scale=0.15, size=2), -1.0])
+    at = (float(rng.normal(scale=4.0)), depth + float(rng.uniform(-15.0, 15.0)), float(rng.uniform(40.0, 120.0)))
+    unit = torch.from_numpy(direction / np.linalg.norm(direction))
+    amounts = construct.amounts(unit, torch.tensor(at, dtype=torch.float64))
+    surface = torch.from_numpy(np.array(construct.specimen.implant.vertices))
+    stress = float(von_mises(construct.element.stress(surface, amounts)).quantile(_HIGHEST))
+    newton = float(rng.uniform(*_STRESSED)) * construct.element.constants.yield_stress / stress
+    force = quantity((newton * unit).tolist(), "N")
+    return LoadRecipe.of({"force": force, "at": quantity(at, "mm"), **_misalignment(draw)})
+
+
+def _screws(draw: Draw) -> list[Screw]:
+    """Screws of the undeformed plate, of random length, radius and tilt."""
     rng = np.random.default_rng([draw.seed, 21])
-    listed: list[Screw] = []
-    parts = []
-    top, tissue = draw.thickness / 2, _tissue(draw)
+    contour, screws = _contour(draw), []
     for number, hole in enumerate(draw.holes_used):
-        height = draw.hole_heights[hole]
-        z = torch.tensor([height], dtype=torch.float64)
         direction = rng.normal(size=2)
         tilt = math.radians(rng.uniform(0.4, 1.0) * draw.tilt_deg) * direction / np.linalg.norm(direction)
         offset = draw.hole_offset if rng.random() < 0.5 else -draw.hole_offset
         length, radius = float(rng.uniform(26.0, 40.0)), float(rng.uniform(1.6, 2.2))
         axis = torch.tensor([math.sin(tilt[0]), -1.0, math.sin(tilt[1])], dtype=torch.float64)
-        head = torch.tensor([0.0, top, offset], dtype=torch.float64)
-        tip = head + length * axis / axis.norm()
-        ends = torch.stack([head, tip])
-        fragment = fragment_at(height)
-        before, after = (motion.frames(z)[0] for motion in (rest, loaded))
-        start, end = ends @ before[:3, :3].T + before[:3, 3]
-        listed.append(Screw(tuple(start.tolist()), tuple(end.tolist()), radius, draw.screw_material, f"screw{number}"))
-        shaft = ends @ after[:3, :3].T + after[:3, 3]
-        parts.append(
-            Part(f"screw{number}", Cylinder(shaft[0], shaft[1], radius), draw.screw_material, (fragment,), tissue)
-        )
-        if draw.heads:
-            cap = torch.stack([head, head + torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64)])
-            cap = cap @ after[:3, :3].T + after[:3, 3]
-            parts.append(Part(f"head{number}", Cylinder(cap[0], cap[1], 1.7 * radius), draw.screw_material, (), tissue))
-    return listed, parts
+        head = torch.tensor([0.0, draw.thickness / 2, offset], dtype=torch.float64)
+        ends = torch.stack([head, head + length * axis / axis.norm()])
+        frame = contour.frames(torch.tensor([draw.hole_heights[hole]], dtype=torch.float64))[0]
+        start, end = ends @ frame[:3, :3].T + frame[:3, 3]
+        screws.append(Screw(tuple(start.tolist()), tuple(end.tolist()), radius, draw.screw_material, f"screw{number}"))
+    return screws
 
 
-def _limb(draw: Draw, loaded: PlateMotion) -> list[Part]:
-    """The two bone fragments, each moved with its screws, and the water around them."""
-    depth = -(draw.thickness / 2 + 1.5 + draw.bone_radius)
-    parts, tissue = [], _tissue(draw)
-    for fragment, side in zip(FRAGMENTS, (-1.0, 1.0), strict=True):
-        heights = [draw.hole_heights[hole] for hole in draw.holes_used]
-        held = [z for i, z in enumerate(heights) if z * side > 0 and i != draw.loose]
-        points = torch.tensor([[x, y, z] for z in held for x in (-3.0, 3.0) for y in (0.0, depth)]).double()
-        motion = fit_rigid(points, loaded(points))
-        near = torch.tensor([0.0, depth, side * GAP / 2], dtype=torch.float64)
-        far = torch.tensor([0.0, depth, side * 160.0], dtype=torch.float64)
-        bone = Tube(near, far, draw.bone_radius, draw.bone_radius - draw.cortex).moved(motion)
-        parts.append(Part(fragment, bone, "cortical_bone", inside=tissue))
-        if draw.marrow:
-            core = Cylinder(near, far, draw.bone_radius - draw.cortex - 1e-3).moved(motion)
-            parts.append(Part(f"{fragment} marrow", core, "cancellous_bone", inside=tissue))
-    if tissue is not None:
-        ends = torch.tensor([[0.0, depth, -170.0], [0.0, depth, 170.0]], dtype=torch.float64)
-        parts.append(Part(tissue, Cylinder(ends[0], ends[1], draw.water_radius), "water"))
-    return parts
-
-
-def _tissue(draw: Draw) -> str | None:
-    return "tissue" if draw.water_radius else None
-
-
-def _bead_positions(draw: Draw) -> Tensor:
-    """Centres (8, 3) of beads beside the straight plate, near and beyond its outermost screws."""
+def _beads(draw: Draw) -> Tensor:
+    """Centres (8, 3) of beads beside the undeformed plate, near and beyond its outermost screws."""
     group = torch.tensor([[11.0, 2.0, 4.0], [-11.0, -2.0, 8.0], [10.0, -3.0, 14.0], [-10.0, 3.0, 19.0]]).double()
     low, high = (draw.hole_heights[hole] for hole in (draw.holes_used[0], draw.holes_used[-1]))
     below = group * torch.tensor([1.0, 1.0, -1.0]) + torch.tensor([0.0, 0.0, low + 4.0])
     above = group * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([0.0, 0.0, high - 4.0])
-    return torch.cat([below, above])
+    return _contour(draw)(torch.cat([below, above]))

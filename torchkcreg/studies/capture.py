@@ -13,12 +13,12 @@ from torch import Tensor
 
 from torchkcreg.console import markdown_table
 from torchkcreg.geometry import fit_rigid, rotation_about, transform_points
-from torchkcreg.implant import Component, ImplantPointCloud
-from torchkcreg.physics import line_integrals_from_intensity
+from torchkcreg.implant import ImplantPointCloud, Screw
 from torchkcreg.registration import RegistrationConfig, RegistrationData, RegistrationResult, Stage, register
-from torchkcreg.simulation import Load, SimulatedCase, weight_bearing_case
+from torchkcreg.simulation import SimulatedCase, weight_bearing_case
+from torchkcreg.simulation.bench import LoadRecipe
 
-MISALIGNED = Load(rotation_deg=(0.4, -0.5, 0.6), translation_mm=(0.8, -0.7, 1.0))  # rigid motion, no bending
+MISALIGNED = LoadRecipe.of({"rotation": "[0.4, -0.5, 0.6] deg", "translation": "[0.8, -0.7, 1.0] mm"})  # no bending
 DEFAULT_OFFSETS = (2.0, 5.0, 10.0, 15.0)
 CAPTURED_MM = 0.2
 _FEW_NODES = 8  # coarsening factor of the point cloud: a rigid error needs few nodes
@@ -191,11 +191,9 @@ def rigid_stages(config: RegistrationConfig) -> RegistrationConfig:
 
 def registration_inputs(
     case: SimulatedCase, pitch_mm: float = 0.25
-) -> tuple[RegistrationData, ImplantPointCloud, list[Component]]:
+) -> tuple[RegistrationData, ImplantPointCloud, list[Screw]]:
     """Projections, implant and screws of a simulated case, as inputs of a registration."""
-    lines, mask = line_integrals_from_intensity(case.intensity, case.open_beam, saturation=case.saturation)
-    screws = [Component.of(screw, pitch=pitch_mm) for screw in case.screws]
-    return RegistrationData(case.geometry, lines, mask), ImplantPointCloud.from_mesh(case.implant, pitch_mm), screws
+    return case.data(), case.cloud(pitch_mm), case.screws
 
 
 def random_pose(pose: Tensor, offset: float, center: Tensor, generator: torch.Generator) -> Tensor:

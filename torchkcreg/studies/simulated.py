@@ -18,7 +18,6 @@ from torchkcreg.geometry import ConeBeamGeometry, fit_rigid, transform_points
 from torchkcreg.implant import find_holes
 from torchkcreg.io.arrays import read_array, write_array
 from torchkcreg.mechanics import CarriedLoad
-from torchkcreg.physics import line_integrals_from_intensity
 from torchkcreg.registration import RegisteredImplant, RegistrationConfig, RegistrationData, register
 from torchkcreg.scene import ViewMotions
 from torchkcreg.simulation import Draw, SimulatedCase, draw_case, random_case
@@ -131,7 +130,7 @@ def registered(job: Job, draw: Draw, case: SimulatedCase, *, chosen: list[int] |
         "warnings": "; ".join(result.warnings),
         "seconds": round(time.perf_counter() - start, 1),
         "azimuth": draw.azimuth_deg,
-        "scatter": round(draw.detector.scatter_fraction + draw.detector.scatter_removed, 3),
+        "scatter": round(draw.scatter_to_primary, 3),
         "kind": f"{draw.material} {draw.screw_material} {draw.scanner} {draw.kvp} kV water {draw.water_radius:.0f}",
         "physics": " ".join(f"{name}={value:.3f}" for name, value in result.intensity.items()),
         **load_errors(case, result.implants[0].deformation),
@@ -155,8 +154,8 @@ def _unrelated(draw: Draw, data: RegistrationData, images: str) -> dict[str, Any
     if images == "turned":
         return {"line_integrals": data.line_integrals.flip(-2, -1), "mask": data.mask.flip(-2, -1)}
     other_case = random_case(draw_case(draw.seed + 1000))
-    lines, mask = line_integrals_from_intensity(other_case.intensity.float(), other_case.open_beam)
-    return {"line_integrals": lines, "mask": mask, "geometry": other_case.geometry}
+    data = other_case.data()
+    return {"line_integrals": data.line_integrals, "mask": data.mask, "geometry": data.geometry}
 
 
 def errors_of(implant: RegisteredImplant, case: SimulatedCase, nodes: Tensor, truth: Tensor) -> Row:

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchkcreg.evaluation import bb_rmse
 from torchkcreg.geometry import MultisourceScanner
-from torchkcreg.implant import Component, ImplantPointCloud
+from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.physics import line_integrals_from_intensity, tungsten_spectrum
 from torchkcreg.registration import RegistrationConfig, RegistrationData, register
 from torchkcreg.simulation.bench import ElasticConstruct, Recipe, acquisitions, specimen, views_of
@@ -57,7 +57,7 @@ def registered_load(job: Job) -> Row:
         RegistrationData(geometry, lines, mask),
         config,
         spectrum=spectrum if job["known"] else None,
-        components=[Component.of(screw) for screw in made.screws] if job["known"] else (),
+        components=made.screws if job["known"] else (),
         holes=made.holes,
     )
     nodes = cloud.coarsened(_NODES_COARSER).points.double()

@@ -5,10 +5,11 @@ scatter comes from kernels that depend on the object's thickness, blur from foca
 solid bodies.
 """
 
-from .acquisition import Acquisition, acquisitions, panel_of, views_of
+from .acquisition import Acquisition, acquisitions, panel_of, simulate_projections, views_of
 from .loaded import ElasticConstruct, Loaded, loaded
 from .panel import FlatPanel, scatter_shapes, scattered
-from .recipe import LoadRecipe, Recipe
+from .quantities import quantity
+from .recipe import LoadRecipe, PanelRecipe, Recipe
 from .specimen import Specimen, recipe_files, recipe_in, specimen
 
 __all__ = [
@@ -17,15 +18,18 @@ __all__ = [
     "FlatPanel",
     "LoadRecipe",
     "Loaded",
+    "PanelRecipe",
     "Recipe",
     "Specimen",
     "acquisitions",
     "loaded",
     "panel_of",
+    "quantity",
     "recipe_files",
     "recipe_in",
     "scatter_shapes",
     "scattered",
+    "simulate_projections",
     "specimen",
     "views_of",
 ]

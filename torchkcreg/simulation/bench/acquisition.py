@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-import trimesh
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
@@ -69,25 +68,97 @@ def acquisitions(
     jobs = [(i, name, load) for i, (name, load) in enumerate(recipe.configurations.items()) if name not in kept]
     if construct is None and any(any(load.force) for _, _, load in jobs):
         construct = ElasticConstruct(specimen)
-    panel, spacing = panel_of(recipe), geometry.pixel_spacing
     for number, name, load in jobs:
         state = loaded(specimen, load, construct)
         parts = parts_in_beam(specimen, state)
-        primaries = _primaries(geometry, parts, spectrum, recipe.panel.supersample, name if progress else None)
-        scatter = scattered(primaries, spacing, recipe.scatter_to_primary)
-        generator = torch.Generator(device="cpu").manual_seed(recipe.seed * 1009 + number)
-        magnifications = _magnifications(geometry, state.mesh(specimen.implant))
-        images = [
-            panel.counts(panel.penumbra(primary, spacing, magnified) + veil, spacing, generator)
-            for primary, veil, magnified in zip(primaries, scatter, magnifications, strict=True)
-        ]
-        yield Acquisition(name, state, parts, torch.stack(images), mean_ratio(scatter, primaries))
+        counts, ratio = _images(
+            geometry,
+            parts,
+            spectrum,
+            panel=panel_of(recipe),
+            scatter_to_primary=recipe.scatter_to_primary,
+            middle=torch.tensor(state.mesh(specimen.implant).centroid, dtype=torch.float64, device="cpu"),
+            supersample=recipe.panel.supersample,
+            seed=recipe.seed * 1009 + number,
+            label=name if progress else None,
+        )
+        yield Acquisition(name, state, parts, counts, ratio)
 
 
-def _magnifications(geometry: ConeBeamGeometry, implant: trimesh.Trimesh) -> list[float]:
-    """Magnification of the implant's centroid in each view."""
-    middle = torch.tensor(implant.centroid, dtype=torch.float64, device="cpu")
-    _, depths = geometry.project(middle[None])
+def simulate_projections(
+    geometry: ConeBeamGeometry,
+    parts: Sequence[Part],
+    spectrum: Spectrum | Mapping[str, Spectrum],
+    *,
+    panel: FlatPanel | None = None,
+    scatter_to_primary: float = 0.0,
+    supersample: int = 2,
+    seed: int = 0,
+) -> Tensor:
+    """Simulated projections of any parts: counts (V, rows, cols), uint16.
+
+    Path lengths are exact averages over sub-pixels for meshes, and means of 2 x 2 rays for solids. The transmission is
+    averaged over each pixel after the exponential. Focal spot, scatter, quanta, scintillator and glare follow, see
+    `FlatPanel`; the focal spot's blur is that of an object at the origin.
+
+    Args:
+        geometry: The views.
+        parts: Bodies in the beam, in the world's frame.
+        spectrum: The detected spectrum, or one for each source of the geometry, by name.
+        panel: The detector; the default one if None.
+        scatter_to_primary: Mean scatter over mean primary in the object's shadow, over all views.
+        supersample: Sub-pixels along each side of a pixel.
+        seed: Seed of the noise.
+
+    Raises:
+        ValueError: If the parts are invalid (see `material_paths`), or the source of a view has no spectrum.
+    """
+    origin = torch.zeros(3, dtype=torch.float64, device="cpu")
+    counts, _ = _images(
+        geometry,
+        parts,
+        spectrum,
+        panel=panel or FlatPanel(),
+        scatter_to_primary=scatter_to_primary,
+        middle=origin,
+        supersample=supersample,
+        seed=seed,
+        label=None,
+    )
+    return counts
+
+
+def _images(
+    geometry: ConeBeamGeometry,
+    parts: Sequence[Part],
+    spectrum: Spectrum | Mapping[str, Spectrum],
+    *,
+    panel: FlatPanel,
+    scatter_to_primary: float,
+    middle: Tensor,
+    supersample: int,
+    seed: int,
+    label: str | None,
+) -> tuple[Tensor, float]:
+    """Counts (V, rows, cols), uint16, and the ratio of mean scatter to mean primary behind the object.
+
+    The focal spot's blur is that of an object at `middle` (3,). A `label` shows a progress bar of this name. All else
+    is as in `simulate_projections`.
+    """
+    spacing = geometry.pixel_spacing
+    primaries = _primaries(geometry, parts, spectrum, supersample, label)
+    scatter = scattered(primaries, spacing, scatter_to_primary)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
+    images = [
+        panel.counts(panel.penumbra(primary, spacing, magnified) + veil, spacing, generator)
+        for primary, veil, magnified in zip(primaries, scatter, _magnifications(geometry, middle), strict=True)
+    ]
+    return torch.stack(images), mean_ratio(scatter, primaries)
+
+
+def _magnifications(geometry: ConeBeamGeometry, point: Tensor) -> list[float]:
+    """Magnification of a point (3,) in each view."""
+    _, depths = geometry.project(point[None])
     magnified: list[float] = (geometry.detector_distances / depths[:, 0]).tolist()
     return magnified
 
@@ -136,14 +207,33 @@ def views_of(recipe: ScannerRecipe) -> ConeBeamGeometry:
 
 
 def _primaries(
-    geometry: ConeBeamGeometry, parts: list[Part], spectrum: Spectrum, factor: int, label: str | None
+    geometry: ConeBeamGeometry,
+    parts: Sequence[Part],
+    spectrum: Spectrum | Mapping[str, Spectrum],
+    factor: int,
+    label: str | None,
 ) -> Tensor:
     """Transmitted share of the beam (V, rows, cols), averaged over each pixel after the exponential."""
     fine = geometry.refined(factor)
-    beam: Beam | None = None
+    spectra = _spectra(spectrum, geometry)
+    beams: dict[int, Beam] = {}
     images = []
-    for matrix in progress_bar(fine.projection_matrices, desc=label, shown=label is not None):
+    for matrix, of_view in zip(progress_bar(fine.projection_matrices, desc=label, shown=label is not None), spectra):
         paths = material_paths(parts, matrix.cpu(), fine.det_shape)
-        beam = beam or Beam.of([material(name) for name in paths], spectrum, num_bins=None)
-        images.append(beam.transmission(torch.stack(list(paths.values()))[None, :, None], pooling=factor)[0, 0])
+        if not paths:
+            images.append(torch.ones(geometry.det_shape, dtype=torch.float64, device="cpu"))
+            continue
+        if id(of_view) not in beams:
+            beams[id(of_view)] = Beam.of([material(name) for name in paths], of_view, num_bins=None)
+        lengths = torch.stack(list(paths.values()))[None, :, None]
+        images.append(beams[id(of_view)].transmission(lengths, pooling=factor)[0, 0])
     return torch.stack(images)
+
+
+def _spectra(spectrum: Spectrum | Mapping[str, Spectrum], geometry: ConeBeamGeometry) -> list[Spectrum]:
+    """Spectrum of each view."""
+    if isinstance(spectrum, Spectrum):
+        return [spectrum] * geometry.num_views
+    if missing := sorted(set(geometry.sources or ("no source",)) - set(spectrum)):
+        raise ValueError(f"spectrum must have one for each source, got none for {', '.join(missing)}")
+    return [spectrum[source] for source in geometry.sources or ()]

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from torchkcreg.deformation import FiniteElementDeformation
 from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
-from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.implant import ImplantPointCloud, Screw
 from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
+from torchkcreg.mechanics.holds import rigid_fields
 from torchkcreg.physics import elastic_constants
-from torchkcreg.simulation.elastic import hold_motions, rigid_at
 from torchkcreg.simulation.hardware import mapped
 from torchkcreg.simulation.loads import Load
 
@@ -71,7 +71,9 @@ class ElasticConstruct:
         holds = holds_of(cloud, specimen.holes)
         self.element = Superelement.of(cloud, constants, holds, negligible_mm=0.0)
         places = torch.tensor([hold.center for hold in holds], dtype=torch.float64, device="cpu")
-        for screw in specimen.screws:
+        for number, screw in enumerate(specimen.screws):
+            if not specimen.holds(number):
+                continue
             head = torch.tensor(screw.start, dtype=torch.float64, device="cpu")
             sides[int((places - head).norm(dim=1).argmin())] = specimen.fragment_of(screw.start[2])
         missing = {DISTAL, PROXIMAL} - set(sides.values())
@@ -129,7 +131,14 @@ class ElasticConstruct:
             return transform_points(pose, deformation(exact)).reshape(points.shape).to(points)
 
         fragments = {side: pose @ motion_of for side, motion_of in moved.items()}
-        screws = [fragments[self.specimen.fragment_of(screw.start[2])] for screw in self.specimen.screws]
+        surface = torch.from_numpy(np.array(self.specimen.implant.vertices))
+        moved_surface = motion(surface)
+        screws = [
+            fragments[self.specimen.fragment_of(screw.start[2])]
+            if self.specimen.holds(number)
+            else _near_motion(surface, moved_surface, screw)[0]
+            for number, screw in enumerate(self.specimen.screws)
+        ]
         return Loaded(motion, fragments, screws, CarriedLoad.of(self.element, amounts))
 
     def _held(self) -> dict[str, Tensor]:
@@ -183,6 +192,7 @@ def loaded(specimen: Specimen, recipe: LoadRecipe, construct: ElasticConstruct |
         torsion_deg=recipe.torsion,
         s_bend_deg=recipe.s_bend,
         zone_mm=recipe.zone,
+        center_mm=recipe.center,
         length_mm=float(np.ptp(specimen.implant.vertices[:, 2])),
         rotation_deg=recipe.rotation,
         translation_mm=recipe.translation,
@@ -196,11 +206,11 @@ def _of_motion(specimen: Specimen, motion: Callable[[Tensor], Tensor]) -> Loaded
     moved = motion(vertices)
     near: dict[str, list[Tensor]] = {DISTAL: [], PROXIMAL: []}
     screws = []
-    for screw in specimen.screws:
-        away = (vertices - torch.tensor(screw.start, dtype=torch.float64, device="cpu")).norm(dim=1)
-        beside = (away <= max(_NEAR_MM, float(away.sort().values[min(8, len(away) - 1)]))).nonzero().flatten()
-        screws.append(fit_rigid(vertices[beside], moved[beside]))
-        near[specimen.fragment_of(screw.start[2])].append(beside)
+    for number, screw in enumerate(specimen.screws):
+        motion_of, beside = _near_motion(vertices, moved, screw)
+        screws.append(motion_of)
+        if specimen.holds(number):
+            near[specimen.fragment_of(screw.start[2])].append(beside)
     whole = fit_rigid(vertices, moved)
     fragments = {
         name: fit_rigid(vertices[torch.cat(places)], moved[torch.cat(places)]) if places else whole
@@ -209,5 +219,32 @@ def _of_motion(specimen: Specimen, motion: Callable[[Tensor], Tensor]) -> Loaded
     return Loaded(motion, fragments, screws)
 
 
+def _near_motion(vertices: Tensor, moved: Tensor, screw: Screw) -> tuple[Tensor, Tensor]:
+    """Rigid motion (4, 4) of the implant's vertices near a screw's head, and the indices of these vertices."""
+    distances = (vertices - torch.tensor(screw.start, dtype=torch.float64, device="cpu")).norm(dim=1)
+    near = (distances <= max(_NEAR_MM, float(distances.sort().values[min(8, len(distances) - 1)]))).nonzero().flatten()
+    return fit_rigid(vertices[near], moved[near]), near
+
+
 def _hold_nodes(element: Superelement, hold: int) -> Tensor:
     return element.holds[hold].nodes(transform_points(element.hexahedra.frame, element.hexahedra.positions))
+
+
+def hold_motions(element: Superelement, holds: list[int]) -> Tensor:
+    """Translation and small rotation (A, U, 6) of holds for a unit amount."""
+    positions = transform_points(element.hexahedra.frame, element.hexahedra.positions)
+    motions = []
+    for hold in holds:
+        near = element.holds[hold].nodes(positions)
+        arms = positions[near] - positions.new_tensor(element.holds[hold].center)
+        fields = rigid_fields(arms)
+        solution = torch.linalg.lstsq(fields.flatten(1).T, element.nodal[:, near].flatten(1).T.to(fields)).solution
+        motions.append(solution.T)
+    return torch.stack(motions, dim=1)
+
+
+def rigid_at(center: Tensor) -> Tensor:
+    """Translation and rotation (6, 6) at a point, for each of the six rigid motions about the origin."""
+    identity = torch.eye(3, dtype=center.dtype, device=center.device)
+    turning = torch.linalg.cross(identity, center.expand(3, 3)).T
+    return torch.cat([torch.cat([identity, turning], dim=1), torch.cat([torch.zeros_like(identity), identity], dim=1)])

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -56,6 +57,33 @@ class FlatPanel:
     gain_error: float = 0.0
     dead_pixels: float = 0.0
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.open_beam > 0 and self.photons > 0):
+            raise ValueError(f"open_beam and photons must be positive, got {self.open_beam} and {self.photons}")
+        if not 1 <= self.bits <= 16:
+            raise ValueError(f"bits must be 1 to 16, got {self.bits}")
+        for name in ("focal_spot_mm", "half_contrast_lp_mm", "glare", "glare_reach_mm", "electronic_noise"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
+    @classmethod
+    def ideal(cls, **changes: Any) -> FlatPanel:
+        """Panel of 16 bits without blur, glare and noise; counts are still rounded.
+
+        Args:
+            changes: Attributes that differ, such as `photons` for quantum noise.
+
+        >>> FlatPanel.ideal().saturation
+        65535
+        """
+        sharp = {"focal_spot_mm": 0.0, "half_contrast_lp_mm": math.inf, "glare": 0.0}
+        clean = {"photons": math.inf, "electronic_noise": 0.0, "open_beam": 60000.0, "bits": 16}
+        return cls(**{**sharp, **clean, **changes})
+
+    def without_noise(self) -> FlatPanel:
+        """The panel without quantum and electronic noise; counts are still rounded."""
+        return replace(self, photons=math.inf, electronic_noise=0.0)
 
     @property
     def saturation(self) -> int:

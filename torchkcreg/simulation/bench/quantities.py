@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, PlainSerializer
@@ -19,6 +19,17 @@ _UNITS = {
 _A = {kind: f"an {kind}" if kind == "angle" else f"a {kind}" for kind in _UNITS}
 _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s]*)\s*$")
 _VECTOR = re.compile(r"^\s*\[(.*)\]\s*(\S*)\s*$", re.DOTALL)
+
+
+def quantity(value: float | Sequence[float], unit: str) -> str:
+    """A number, or three, with a unit, as recipes take them.
+
+    >>> quantity(3.5, "mm"), quantity((0.0, 0.0, -600.0), "N")
+    ('3.5 mm', '[0.0, 0.0, -600.0] N')
+    """
+    if isinstance(value, Sequence):
+        return f"[{', '.join(repr(float(number)) for number in value)}] {unit}"
+    return f"{float(value)!r} {unit}"
 
 
 def _number(kind: str) -> Callable[[Any], float]:

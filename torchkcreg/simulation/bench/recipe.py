@@ -142,6 +142,7 @@ class ScrewsRecipe(Config):
         material: Material of every screw; the implant's if None.
         tilt: Largest angle between a screw and its hole's axis. The angles are random.
         heads: Heads above the plate; none if None.
+        loose: Numbers of screws, counted from 0, that no longer hold in the bone: they move with the implant.
     """
 
     file: Path | None = None
@@ -151,6 +152,7 @@ class ScrewsRecipe(Config):
     material: str | None = None
     tilt: Angle = 0.0
     heads: HeadRecipe | None = None
+    loose: tuple[int, ...] = ()
 
     @model_validator(mode="after")
     def _one_source(self) -> ScrewsRecipe:
@@ -263,7 +265,8 @@ class LoadRecipe(Config):
             computed by finite elements.
         at: Point where the force acts; if None, on the bone's axis at the height of the fracture.
         bend, lateral, torsion, s_bend: Angles between the implant's ends, instead of a force; see `Load`.
-        zone: The implant is bent within this distance of its middle.
+        zone: The implant is bent within this distance of `center`.
+        center: Height of the middle of the bent stretch.
         rotation, translation: Rigid motion of the implant with its bone, about the origin.
     """
 
@@ -274,6 +277,7 @@ class LoadRecipe(Config):
     torsion: Angle = 0.0
     s_bend: Angle = 0.0
     zone: Length = 27.0
+    center: Length = 0.0
     rotation: Turn = (0.0, 0.0, 0.0)
     translation: Place = (0.0, 0.0, 0.0)
 

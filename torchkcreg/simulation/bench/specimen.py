@@ -61,6 +61,10 @@ class Specimen:
         moved = [transform_points(fragments[self.fragment_of(float(bead[2]))], bead[None]) for bead in beads]
         return torch.cat([beads[:0], *moved])
 
+    def holds(self, number: int) -> bool:
+        """True if the screw of this number holds in its fragment."""
+        return number not in self.recipe.screws.loose
+
     @property
     def head(self) -> HeadRecipe | None:
         """Screw heads that are imaged but not in the list of screws."""

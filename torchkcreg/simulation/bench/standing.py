@@ -86,7 +86,7 @@ def _bones(
     if bone is None:
         return parts
     for fragment, side in ((DISTAL, -1.0), (PROXIMAL, 1.0)):
-        low, high = (bone.axis[2] + bone.gap_at + side * x for x in (bone.gap / 2, bone.reach))
+        low, high = (bone.gap_at + side * x for x in (bone.gap / 2, bone.reach))
         near, far = (_tensor((bone.axis[0], bone.axis[1], z)) for z in (low, high))
         motion = state.fragments[fragment]
         tube = Tube(near, far, bone.outer_radius, bone.inner_radius).moved(motion)
