@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from pydantic import ValidationError
-from small_scene import RIGID, SCREW, bend, geometry, image, plate, pose, scene
+from small_scene import GRID, PLAIN, RIGID, SCREW, bend, geometry, image, plate, pose, scene
 
 from torchkcreg.geometry import transform_points
 from torchkcreg.registration import (
@@ -26,8 +26,6 @@ from torchkcreg.registration import (
     with_background,
 )
 
-GRID = {"grid_shape": (4, 4, 6), "grid_spacing_mm": (10.0, 10.0, 12.0)}
-PLAIN = RegistrationConfig(stages=RIGID, **GRID)
 BENDING = RegistrationConfig(
     stages=(Stage(oversampling=1), Stage(groups=3, oversampling=1, tolerance=1e-4)), stiffness=1.0, beta=1e-7, **GRID
 )

@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-from small_scene import SCREW, image, pose, scene
-from test_register import PLAIN
+from small_scene import PLAIN, SCREW, image, pose, scene
 
 from torchkcreg.registration import Stage, StageRun
 from torchkcreg.registration.estimated_background import facing_data

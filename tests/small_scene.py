@@ -26,6 +26,9 @@ RIGID = (
     Stage(oversampling=1, tolerance=1e-4),
 )
 
+GRID = {"grid_shape": (4, 4, 6), "grid_spacing_mm": (10.0, 10.0, 12.0)}
+PLAIN = RegistrationConfig(stages=RIGID, **GRID)
+
 
 def plate() -> ImplantPointCloud:
     """A stepped plate of 50 x 10 x 3 mm without symmetry, on 0.5 mm cells."""
