@@ -1,4 +1,4 @@
-"""Conversion to plain types for JSON, YAML and checkpoints, and checks of values read from them."""
+"""Conversion to plain types for JSON, YAML and checkpoints, checks of values read from them, and errors in a line."""
 
 from __future__ import annotations
 
@@ -75,3 +75,13 @@ def require_keys(content: Any, keys: tuple[str, ...], where: str = "") -> None:
     for key in keys:
         if key not in content:
             raise ValueError(f"{key!r}{where} is missing")
+
+
+def first_line(error: Exception, *, line: int = 0, otherwise: str | None = None) -> str:
+    r"""One line of an error's message, the first by default; the error's type, or `otherwise`, if there is no message.
+
+    >>> first_line(ValueError("no header\nat byte 3")), first_line(KeyError(), otherwise="damaged")
+    ('no header', 'damaged')
+    """
+    lines = str(error).strip().splitlines()
+    return lines[line] if lines else otherwise or type(error).__name__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -13,6 +14,9 @@ import torch
 
 from torchkcreg.cli import main
 from torchkcreg.commands import RegistrationFiles, register_files, write_report
+from torchkcreg.commands.register import _bending as bending_of
+from torchkcreg.commands.report import implant_scene
+from torchkcreg.geometry import rigid_matrix, transform_points
 from torchkcreg.io import read_point_cloud_ply, read_run, write_point_cloud_ply
 
 CHROMIUM = next(
@@ -135,3 +139,21 @@ def test_a_reconstructions_page_says_what_was_found_of_scatter_beam_and_metal(tm
     assert "<h1>Reconstruction: " in page and "scatter: fraction" in page and "estimated beam: kvp" in page
     assert "known metal" in page and "steel, steel" in page
     assert "expected error" not in page  # of none of these
+
+
+def test_bending_is_what_a_rigid_motion_does_not_explain():
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).double() * 50
+    turned = transform_points(
+        rigid_matrix(torch.tensor([0.1, 0.2, -0.1]), torch.tensor([1.0, 2.0, 3.0])).double(), points
+    )
+    assert bending_of(points, turned) < 1e-9
+    bent = points + torch.stack([0 * points[:, 0], 0.001 * (points[:, 2] - 25) ** 2, 0 * points[:, 0]], dim=-1)
+    assert 0.2 < bending_of(points, bent) < 0.7
+
+
+def test_the_3d_view_opens_nearly_face_on():
+    generator = torch.Generator().manual_seed(1)
+    plate = torch.rand(500, 3, generator=generator) * torch.tensor([12.0, 3.0, 100.0])  # thin along y
+    scene = implant_scene(plate, torch.zeros_like(plate), torch.zeros(500))
+    off = (scene["yaw"] - 0.5) % math.pi
+    assert min(off, math.pi - off) < 0.05

@@ -194,7 +194,7 @@ def test_two_plates_are_registered_together_each_with_its_own_pose_and_bend() ->
         error = (result.warp(points, implant=assembly.name) - assembly.warp(points)).norm(dim=-1)
         assert float(error.detach().square().mean().sqrt()) < 0.03, assembly.name
     assert [implant.name for implant in result.implants] == ["medial", "implant"]
-    with pytest.raises(KeyError, match="no implant 'lateral': there are medial, implant"):
+    with pytest.raises(ValueError, match="no implant 'lateral': there are medial, implant"):
         result.warp(points, implant="lateral")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import ConeBeamGeometry, transform_points
+from torchkcreg.geometry import ConeBeamGeometry, fit_rigid, transform_points
 from torchkcreg.io import LAYERS, RunFolder, read_config, write_figure, write_geometry, write_layers
 from torchkcreg.registration import (
     Callback,
@@ -184,16 +184,18 @@ def _continue(run: RunFolder, trainer: Trainer, record: dict[str, Any]) -> None:
 
 
 def _metrics(result: RegistrationResult, scene: Scene, starts: Sequence[Tensor], seconds: float) -> dict[str, Any]:
-    motions = {}
+    motions, bendings = {}, {}
     for implant, assembly, start in zip(result.implants, scene, starts, strict=True):
         points = assembly.implant.points.double()
         motions[implant.name] = (implant.warp(points) - transform_points(start, points)).norm(dim=-1)
+        bendings[implant.name] = _bending(points, points + implant.displacement(points))
     return {
         "status": result.status,
         "gc": result.gc.tolist(),
         "node_std_mm": result.diagnostics.get("node_std_mm"),
         **_motion(torch.cat(list(motions.values()))),
-        "implants": {name: _motion(motion) for name, motion in motions.items()},
+        "largest_bending_mm": max(bendings.values()),
+        "implants": {name: {**_motion(m), "largest_bending_mm": bendings[name]} for name, m in motions.items()},
         "intensity": result.intensity,
         "screws_found": [screw.to_dict() for screw in result.screws_found],
         "stages": result.stages,
@@ -201,6 +203,11 @@ def _metrics(result: RegistrationResult, scene: Scene, starts: Sequence[Tensor],
         "seconds": seconds,
         "warnings": result.warnings,
     }
+
+
+def _bending(points: Tensor, bent: Tensor) -> float:
+    """Largest distance, mm, of bent points (N, 3) from the best rigid fit of the points (N, 3) without bending."""
+    return float((transform_points(fit_rigid(points, bent), points) - bent).norm(dim=-1).max())
 
 
 def _motion(distances: Tensor) -> dict[str, float]:

@@ -28,6 +28,7 @@ from torchkcreg.io import (
 )
 from torchkcreg.kernels import choose_backend
 from torchkcreg.physics import Spectrum, material
+from torchkcreg.plain import first_line
 from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConfig
 from torchkcreg.scene import RegistrationData
 
@@ -229,7 +230,7 @@ def _device(name: str) -> Tensor:
     try:
         return torch.empty(0, device=name)
     except (RuntimeError, AssertionError, ValueError) as error:  # which one torch raises depends on the device
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise ValueError(f"device {name!r} is not available: {reason[:120]}") from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.geometry import ConeBeamGeometry, DetectorFrames
+from torchkcreg.geometry import ConeBeamGeometry, DetectorFrames, principal_axes
 from torchkcreg.io import (
     LAYERS,
     REPORT,
@@ -131,17 +132,24 @@ def _run_rows(metrics: dict[str, Any]) -> list[Row]:
     rows = []
     deviation = metrics.get("node_std_mm")
     error = f"{deviation:.3f} mm" if isinstance(deviation, float) else ""
-    for key, name in (("mean_motion_mm", "mean motion of the implant"), ("largest_motion_mm", "largest motion")):
+    if isinstance(metrics.get("largest_bending_mm"), float):
+        about = "largest distance of a node from the best rigid fit of the undeformed implant"
+        rows.append(Row("bending of the implant", f"{metrics['largest_bending_mm']:.3f} mm", about=about))
+    for key, name, about in (
+        ("mean_motion_mm", "mean motion of the implant", "from its start pose"),
+        ("largest_motion_mm", "largest motion", "from its start pose"),
+    ):
         if isinstance(metrics.get(key), float):
-            rows.append(Row(name, f"{metrics[key]:.3f} mm", error, "from the undeformed implant in its frame"))
+            rows.append(Row(name, f"{metrics[key]:.3f} mm", error, about))
     correlations = [value for value in metrics.get("gc") or [] if isinstance(value, float)]
     if correlations:
         about = "of each view: " + " ".join(f"{value:.3f}" for value in correlations)
         rows.append(Row("gradient correlation, least", f"{min(correlations):.3f}", about=about))
+    rows += _scalar_rows(metrics)
     for name, value in (metrics.get("intensity") or {}).items():
         label, unit = INTENSITY.get(name, (str(name).replace("_", " "), ""))
-        rows.append(Row(label, f"{value:.3g} {unit}".strip(), about="estimated together with the implant"))
-    return [*rows, *_scalar_rows(metrics)]
+        rows.append(Row(f"image model: {label}", f"{value:.3g} {unit}".strip(), about="estimated with the implant"))
+    return rows
 
 
 def _scalar_rows(metrics: dict[str, Any]) -> list[Row]:
@@ -240,6 +248,7 @@ def implant_scene(
         "moved": _rounded(moved[chosen].flatten()),
         "displacement": _rounded(moved[chosen].norm(dim=-1)),
         "std": _rounded(std[chosen]),
+        "yaw": _yaw(points),
         "pitch": round(1.2 * (volume / len(chosen)) ** (1 / 3), 3),
         "sources": [],
         "detectors": [],
@@ -251,6 +260,12 @@ def implant_scene(
         scene["sources"] = [_rounded(source) for source in frames.sources]
         scene["detectors"] = [[_rounded(corner[view]) for corner in corners] for view in range(views.num_views)]
     return scene
+
+
+def _yaw(points: Tensor) -> float:
+    """Angle about z, radians, from which the implant is seen nearly face on: half a radian off its thinnest axis."""
+    _, axes = principal_axes(points.double())
+    return round(math.atan2(float(axes[0][0]), float(axes[0][1])) + 0.5, 3)
 
 
 def _rounded(values: Tensor) -> list[float]:

@@ -25,8 +25,8 @@ def warp_files(run_folder: Path, points_file: Path, out: Path, *, implant_name: 
     result, points = read_run(run_folder), read_points(points_file)
     try:
         implant = result.implant(implant_name)
-    except KeyError as error:
-        raise ValueError(f"run folder {run_folder}: {error.args[0]}") from None
+    except ValueError as error:
+        raise ValueError(f"run folder {run_folder}: {error}") from None
     outside = implant.outside(points)
     if outside.any():
         warnings.warn(

@@ -25,10 +25,7 @@ class RigidMotion(Motion):
 
     def __init__(self, deformation: Deformation, cloud: ImplantPointCloud) -> None:
         self.deformation = deformation
-        coarse = cloud.coarsened_to(1.0)
-        points, share = coarse.points.double(), (coarse.volumes / coarse.volumes.sum()).double()[:, None]
-        self.center = (share * points).sum(0)
-        self.radius = (share * (points - self.center) ** 2).sum().sqrt()
+        self.center, self.radius = cloud.gyration()
 
     def features(self, points: Tensor) -> Tensor:
         """Features 1, x + u(x) - c, u(x)."""
@@ -117,7 +114,7 @@ class RigidDeformation(LinearDeformation):
         return {"model": self.model}
 
 
-class LinearMotion(Motion):
+class LinearMotion(RigidMotion):
     """Rotation and translation of the whole implant, in mm, and changes of a linear deformation's amounts.
 
     `x + u(x)` becomes `R (x + sum_m q_m shape_m(x) - c) + c + t`: the shapes turn with the implant.
@@ -129,46 +126,35 @@ class LinearMotion(Motion):
     """
 
     def __init__(self, deformation: LinearDeformation, cloud: ImplantPointCloud, *, free: bool) -> None:
-        self.deformation, self.free = deformation, free
+        super().__init__(deformation, cloud)
+        self.linear, self.free = deformation, free
         self.start = deformation.amounts.detach().clone()
-        coarse = cloud.coarsened_to(1.0)
-        points, share = coarse.points.double(), (coarse.volumes / coarse.volumes.sum()).double()[:, None]
-        self.center = (share * points).sum(0)
-        self.radius = (share * (points - self.center) ** 2).sum().sqrt()
         self.num_parameters = 6 + (len(self.start) if free else 0)
 
     def features(self, points: Tensor) -> Tensor:
         """Features 1, x - c, then the three components of each shape."""
         points = points.double()
         with torch.no_grad():
-            shapes = self.deformation.shapes(points).flatten(-2)
+            shapes = self.linear.shapes(points).flatten(-2)
         return torch.cat([torch.ones_like(points[..., :1]), points - self.center, shapes], dim=-1)
 
     def coefficients(self, steps: Tensor) -> Tensor:
         """Coefficients t, then R - I, then q_m R for each shape."""
-        rotation, turned = self._rotation(steps), self._rotation(steps).mT
-        rigid = torch.cat(
-            [steps[:, None, 3:6], turned - torch.eye(3, dtype=rotation.dtype, device=rotation.device)], dim=1
-        )
+        turn, shift = self.turn_and_shift(steps)
+        turned, same = turn.mT, torch.eye(3, dtype=turn.dtype, device=turn.device)
+        rigid = torch.cat([shift[:, None], turned - same], dim=1)
         amounts = self._amounts(steps)
         return torch.cat([rigid, (amounts[..., None, None] * turned[:, None]).flatten(1, 2)], dim=1)
 
     def penalty(self, steps: Tensor) -> Tensor:
         """Prior of the amounts."""
-        return self.deformation.prior(self._amounts(steps))
+        return self.linear.prior(self._amounts(steps))
 
     @torch.no_grad()
     def accept(self, steps: Tensor) -> Tensor:
         """Store the amounts in the deformation and return the rotation and translation (4, 4)."""
-        self.deformation.amounts.copy_(self._amounts(steps[None])[0])
-        turn = self._rotation(steps[None])[0]
-        shift = self.center + steps[3:6].double() - turn @ self.center
-        motion = rigid_matrix(torch.zeros_like(shift), shift)
-        motion[:3, :3] = turn
-        return motion
-
-    def _rotation(self, steps: Tensor) -> Tensor:
-        return rotation_from_vector(steps[:, :3] / self.radius)
+        self.linear.amounts.copy_(self._amounts(steps[None])[0])
+        return super().accept(steps)
 
     def _amounts(self, steps: Tensor) -> Tensor:
         if self.free:

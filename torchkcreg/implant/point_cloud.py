@@ -234,6 +234,13 @@ class ImplantPointCloud(nn.Module):
         """Edge of a cube with the volume of a cell, mm."""
         return torch.linalg.det(self.cell.double()).abs().item() ** (1 / 3)
 
+    def gyration(self, pitch_mm: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Centre of mass (3,) and radius of gyration, mm, float64, of nodes merged to a pitch of `pitch_mm`."""
+        coarse = self.coarsened_to(pitch_mm)
+        points, share = coarse.points.double(), (coarse.volumes / coarse.volumes.sum()).double()[:, None]
+        center = (share * points).sum(0)
+        return center, (share * (points - center) ** 2).sum().sqrt()
+
     def coarsened_to(self, pitch: float) -> ImplantPointCloud:
         """The cloud on a lattice of about this pitch, mm; unchanged if it is not finer than that. See `coarsened`."""
         factor = max(1, round(pitch / self.pitch))

@@ -9,8 +9,14 @@ from .files import read_json, write_figure, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .implants import read_components, read_init, write_components, write_init
 from .matrix_tables import read_matrix_table, write_matrix_table
-from .meshes import MESH_SUFFIXES, WRITTEN_SUFFIXES, read_mesh, write_mesh, write_point_cloud_ply
-from .point_clouds import read_point_cloud_ply, read_reference, write_points_vtp, write_surface_vtu
+from .meshes import MESH_SUFFIXES, WRITTEN_SUFFIXES, read_mesh, write_mesh
+from .point_clouds import (
+    read_point_cloud_ply,
+    read_reference,
+    write_point_cloud_ply,
+    write_points_vtp,
+    write_surface_vtu,
+)
 from .rtk_geometry import read_rtk, write_rtk
 from .runs import LAYERS, REPORT, RunFolder, implant_of_run, mesh_of_run, read_layers, read_run, versions, write_layers
 from .scans import (

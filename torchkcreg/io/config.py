@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from torchkcreg.plain import plain
+from torchkcreg.plain import first_line, plain
 
 from .files import read_text, write_text
 
@@ -64,5 +64,5 @@ def write_config(path: str | os.PathLike[str], config: dict[str, Any]) -> None:
 def _one_line(error: Exception) -> str:
     problem = getattr(error, "problem", None)
     mark = getattr(error, "problem_mark", None)
-    text = str(problem) if problem else (str(error).splitlines() or ["cannot be parsed"])[0]
+    text = str(problem) if problem else first_line(error, otherwise="cannot be parsed")
     return text if mark is None else f"line {mark.line + 1}: {text}"

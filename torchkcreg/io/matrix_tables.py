@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchkcreg.geometry import ConeBeamGeometry, from_astra, to_astra
+from torchkcreg.plain import first_line
 
 from .files import atomic_path, write_text
 
@@ -96,5 +97,5 @@ def _table(path: Path) -> NDArray:
                 raise ValueError(f"must hold one array, or name it projection_matrices, got {', '.join(names)}")
             return arrays["projection_matrices" if "projection_matrices" in names else names[0]]
     except Exception as error:  # NumPy and zipfile raise various types on a damaged file
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise ValueError(f"cannot be read: {reason[:120]}") from error

@@ -13,11 +13,10 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import torch
 import trimesh
-from torch import Tensor
 
 from torchkcreg.implant import closed_mesh, scanned_surface
+from torchkcreg.plain import first_line
 
 from .files import atomic_path, existing_file
 from .volumes import VOLUME_SUFFIXES, read_volume
@@ -142,7 +141,7 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         mesh = _loaded(path, suffix)
     except Exception as error:  # trimesh's parsers raise various types
         hint = " (3MF needs the package lxml)" if suffix == ".3mf" and _lacks("lxml") else ""
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise ValueError(f"mesh file {path} cannot be read: {reason}{hint}") from error
     if len(mesh.faces) == 0:
         raise ValueError(f"mesh file {path} holds no triangles")
@@ -185,47 +184,6 @@ def write_mesh(path: str | os.PathLike[str], mesh: trimesh.Trimesh) -> None:
         raise ValueError(f"meshes are written as {', '.join(WRITTEN_SUFFIXES)}, got {path}")
     with atomic_path(path) as temporary:
         mesh.export(str(temporary), file_type=suffix[1:])
-
-
-def write_point_cloud_ply(
-    path: str | os.PathLike[str], points: Tensor, displacement: Tensor | None = None, std: Tensor | None = None
-) -> None:
-    """Write points as a binary PLY for ParaView, MeshLab, CloudCompare and 3D Slicer.
-
-    Args:
-        path: The file.
-        points: (N, 3) in mm.
-        displacement: (N, 3) in mm, written as the vertex fields `dx`, `dy`, `dz`, and its length as `displacement`.
-        std: Expected error of each point (N,), mm, written as `std`.
-
-    Raises:
-        ValueError: The shapes do not fit, or there are no points.
-    """
-    if points.ndim != 2 or points.shape[-1] != 3 or len(points) == 0:
-        raise ValueError(f"points must have shape (N, 3), N > 0, got {tuple(points.shape)}")
-    columns = {name: points[:, i] for i, name in enumerate("xyz")}
-    if displacement is not None:
-        if displacement.shape != points.shape:
-            raise ValueError(f"displacement must have shape {tuple(points.shape)}, got {tuple(displacement.shape)}")
-        columns |= {f"d{name}": displacement[:, i] for i, name in enumerate("xyz")}
-        columns["displacement"] = torch.linalg.vector_norm(displacement, dim=-1)
-    if std is not None:
-        if std.shape != points.shape[:1]:
-            raise ValueError(f"std must have shape ({len(points)},), got {tuple(std.shape)}")
-        columns["std"] = std
-    table = np.empty(len(points), dtype=[(name, "<f4") for name in columns])
-    for name, column in columns.items():
-        table[name] = column.detach().cpu().numpy()
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment lengths in mm",
-        f"element vertex {len(points)}",
-        *(f"property float {name}" for name in columns),
-        "end_header",
-    ]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes())
 
 
 def _warn_about_size(path: Path, mesh: trimesh.Trimesh) -> None:

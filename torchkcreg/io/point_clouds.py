@@ -12,6 +12,8 @@ import torch
 import trimesh
 from torch import Tensor
 
+from torchkcreg.plain import first_line
+
 from .files import atomic_path, existing_file
 from .meshes import MESH_SUFFIXES, read_mesh
 from .tables import read_points
@@ -48,7 +50,7 @@ def _ply_points(path: os.PathLike[str]) -> Tensor | None:
     try:
         content = trimesh.load(str(path), process=False)
     except Exception as error:  # the parser raises various types
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise ValueError(f"reference file {path} cannot be read: {reason}") from error
     vertices = getattr(content, "vertices", ())
     if len(getattr(content, "faces", ())):
@@ -145,6 +147,47 @@ def _array_element(
     if values.ndim == 2:
         attributes["NumberOfComponents"] = str(values.shape[1])
     return ElementTree.SubElement(parent, "DataArray", attributes)
+
+
+def write_point_cloud_ply(
+    path: str | os.PathLike[str], points: Tensor, displacement: Tensor | None = None, std: Tensor | None = None
+) -> None:
+    """Write points as a binary PLY for ParaView, MeshLab, CloudCompare and 3D Slicer.
+
+    Args:
+        path: The file.
+        points: (N, 3) in mm.
+        displacement: (N, 3) in mm, written as the vertex fields `dx`, `dy`, `dz`, and its length as `displacement`.
+        std: Expected error of each point (N,), mm, written as `std`.
+
+    Raises:
+        ValueError: The shapes do not fit, or there are no points.
+    """
+    if points.ndim != 2 or points.shape[-1] != 3 or len(points) == 0:
+        raise ValueError(f"points must have shape (N, 3), N > 0, got {tuple(points.shape)}")
+    columns = {name: points[:, i] for i, name in enumerate("xyz")}
+    if displacement is not None:
+        if displacement.shape != points.shape:
+            raise ValueError(f"displacement must have shape {tuple(points.shape)}, got {tuple(displacement.shape)}")
+        columns |= {f"d{name}": displacement[:, i] for i, name in enumerate("xyz")}
+        columns["displacement"] = torch.linalg.vector_norm(displacement, dim=-1)
+    if std is not None:
+        if std.shape != points.shape[:1]:
+            raise ValueError(f"std must have shape ({len(points)},), got {tuple(std.shape)}")
+        columns["std"] = std
+    table = np.empty(len(points), dtype=[(name, "<f4") for name in columns])
+    for name, column in columns.items():
+        table[name] = column.detach().cpu().numpy()
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment lengths in mm",
+        f"element vertex {len(points)}",
+        *(f"property float {name}" for name in columns),
+        "end_header",
+    ]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes())
 
 
 def read_point_cloud_ply(path: str | os.PathLike[str]) -> dict[str, Tensor]:

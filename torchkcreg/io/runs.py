@@ -16,14 +16,13 @@ from torch import Tensor
 
 from torchkcreg.deformation import SplineField
 from torchkcreg.geometry import transform_points
-from torchkcreg.plain import plain
+from torchkcreg.plain import first_line, plain
 from torchkcreg.registration import RegisteredImplant, RegistrationResult
 
 from .arrays import require_loadable, with_arrays, without_arrays, write_arrays
 from .config import read_config, write_config
 from .files import TEMPORARY_PREFIX, atomic_path, read_json, write_figure, write_json
-from .meshes import write_point_cloud_ply
-from .point_clouds import write_points_vtp
+from .point_clouds import write_point_cloud_ply, write_points_vtp
 from .transforms import warp, write_displacement_field, write_itk_transform
 
 if TYPE_CHECKING:
@@ -92,8 +91,8 @@ def implant_of_run(run_folder: Path, name: str | None = None) -> tuple[Registrat
     result = read_run(run_folder)
     try:
         return result, result.implant(name)
-    except KeyError as error:
-        raise ValueError(f"run folder {run_folder}: {error.args[0]}") from None
+    except ValueError as error:
+        raise ValueError(f"run folder {run_folder}: {error}") from None
 
 
 def mesh_of_run(run_folder: Path, number: int = 0) -> Path:
@@ -201,7 +200,7 @@ class RunFolder:
         try:
             return torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch.load fails in many ways on a damaged file
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            reason = first_line(error)
             raise ValueError(f"checkpoint {path} cannot be read: {reason[:120]}") from error
 
     def write_history(self, history: list[dict[str, Any]]) -> None:

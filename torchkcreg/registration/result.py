@@ -16,7 +16,7 @@ from torchkcreg.deformation import Deformation
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.implant import KnownComponent, Screw
 from torchkcreg.physics import Beam, PolyenergeticTransmission, scattered_signal
-from torchkcreg.plain import finite_array, finite_number, require_keys
+from torchkcreg.plain import finite_array, finite_number, first_line, require_keys
 from torchkcreg.scene import RegistrationData, Scene, scene_from_dict, scene_to_dict
 
 from .config import RegistrationConfig
@@ -58,11 +58,11 @@ class RegisteredImplants:
         """The implant of this name; the first one if None.
 
         Raises:
-            KeyError: If there is none of that name.
+            ValueError: If there is none of that name.
         """
         matching = [i for i in self.implants if name in (None, i.name)]
         if not matching:
-            raise KeyError(f"no implant {name!r}: there are {', '.join(i.name for i in self.implants)}")
+            raise ValueError(f"no implant {name!r}: there are {', '.join(i.name for i in self.implants)}")
         return matching[0]
 
     @property
@@ -260,7 +260,7 @@ class RegistrationResult(RegisteredImplants):
         except FileNotFoundError:
             raise
         except Exception as error:  # torch.load fails in many ways on a damaged file
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            reason = first_line(error)
             raise ValueError(f"result {path} cannot be read: {reason[:120]}") from error
         require_keys(content, ("result", "history", "scene"), f" of result {path}")
         result = cls.from_dict(content["result"], history=content["history"])

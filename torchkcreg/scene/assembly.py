@@ -76,7 +76,8 @@ class Assembly(ExactModule):
         if pose.shape != (4, 4):
             raise ValueError(f"implant_to_world must have shape (4, 4), got {tuple(pose.shape)}")
         self.register_buffer("start_pose", pose.to(device, torch.float64))
-        middle, self.radius_mm = _middle_and_radius(implant)
+        middle, radius = implant.gyration()
+        self.radius_mm = float(radius)
         self.register_buffer("middle", middle, persistent=False)
         self.twist = nn.Parameter(torch.zeros(6, dtype=torch.float64, device=device))
         self.register_buffer("tilts", torch.zeros(0, 3, dtype=torch.float64, device=device), persistent=False)
@@ -221,11 +222,3 @@ def followed_points(points: Tensor, head: Tensor, radius: float) -> Tensor:
     near = (distance <= torch.clamp(distance.min() * 1.5, min=radius)).nonzero().flatten()
     chosen = torch.arange(_FOLLOWED, device=points.device) * len(near) // _FOLLOWED
     return points[near[chosen]].double()
-
-
-def _middle_and_radius(implant: ImplantPointCloud) -> tuple[Tensor, float]:
-    """Centre of mass (3,), float64, and radius of gyration of an implant, mm."""
-    coarse = implant.coarsened_to(_NODES_PITCH_MM)
-    points, share = coarse.points.double(), (coarse.volumes / coarse.volumes.sum()).double()[:, None]
-    middle = (share * points).sum(0)
-    return middle, float((share * (points - middle) ** 2).sum().sqrt())

@@ -45,6 +45,7 @@ def history_figure(history: Sequence[dict[str, Any]], *, stage_labels: Sequence[
         axis.set_ylabel(label)
         _mark_stages(axis, spans)
     _name_stages(axes[0], spans, stage_labels)
+    figure.text(0.01, 0.005, "each stage has a loss of its own: compare within a stage", fontsize=7, color="0.4")
     axes[-1].set_xlabel("evaluations" if counted else "iteration")
     axes[-1].set_xlim(x[0] - 0.5, x[-1] + 0.5)
     return figure

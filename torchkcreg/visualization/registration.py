@@ -69,9 +69,10 @@ def registered_layers(result: RegistrationResult, data: RegistrationData) -> dic
 
 
 def _stage_label(stage: Stage) -> str:
-    if stage.modes is not None:
-        return f"{stage.modes} modes"
-    return f"{stage.groups} group{'s' * (stage.groups > 1)}"
+    name = (
+        "rigid" if stage.level.is_rigid else f"{stage.groups} groups" if stage.modes is None else f"{stage.modes} modes"
+    )
+    return name if stage.bin == 1 else f"{name}, bin {stage.bin}"
 
 
 def start_scene(scene: Scene, starts: Sequence[Tensor]) -> Scene:

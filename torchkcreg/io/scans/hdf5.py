@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchkcreg.plain import first_line
+
 from .images import can_hold
 from .series import ImageSeries
 
@@ -68,7 +70,7 @@ def _opened(pyfive: Any, path: Path) -> Any:
     try:
         return pyfive.File(str(path))
     except Exception as error:  # pyfive and struct raise various types on damaged files
-        raise ValueError(f"is no HDF5 file that can be read: {(str(error).splitlines() or ['damaged'])[0]}") from error
+        raise ValueError(f"is no HDF5 file that can be read: {first_line(error, otherwise='damaged')}") from error
 
 
 def _chosen(stacks: dict[str, Any], dataset: str | None) -> str:

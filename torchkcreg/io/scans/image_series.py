@@ -15,6 +15,7 @@ from pydantic import Field
 
 from torchkcreg.io.config import read_config
 from torchkcreg.options import Config
+from torchkcreg.plain import first_line
 
 from .dicom import DICOM_SUFFIXES, dicom_files, dicom_images, is_dicom
 from .hdf5 import HDF5_SUFFIXES, open_hdf5
@@ -196,7 +197,7 @@ def _single(file: Path) -> tuple[NDArray, ImageHeader | None]:
             raise ValueError(f"it holds {series.num_views} images")
         return series.read([0])[0], series.header
     except (ValueError, RuntimeError) as error:
-        raise ValueError(f"{file.name} cannot be read: {(str(error).splitlines() or ['damaged'])[-1]}") from error
+        raise ValueError(f"{file.name} cannot be read: {first_line(error, line=-1, otherwise='damaged')}") from error
 
 
 def _alike(file: Path, first: NDArray) -> NDArray:

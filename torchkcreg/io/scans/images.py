@@ -15,6 +15,8 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 from PIL import Image
 
+from torchkcreg.plain import first_line
+
 PAGE_SUFFIXES = (".tif", ".tiff", ".png")
 _SAMPLE_FORMAT, _BITS, _PHOTOMETRIC = 339, 258, 262  # TIFF tags
 _UNSIGNED = 1
@@ -80,7 +82,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except ValueError:
         raise
     except Exception as error:  # Pillow and its decoders raise various types
-        raise ValueError(f"is no image that can be read: {(str(error).splitlines() or ['damaged'])[0]}") from error
+        raise ValueError(f"is no image that can be read: {first_line(error, otherwise='damaged')}") from error
 
 
 def check_meta_header(path: Path) -> None:
@@ -164,7 +166,7 @@ def image_header(path: Path) -> PixelHeader | None:
     try:
         reader = opened(path)
     except RuntimeError as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        reason = first_line(error, line=-1)
         raise ValueError(f"projections file {path} cannot be read: {reason}") from error
     (cols, rows), (du, dv), (u0, v0) = (x[:2] for x in (reader.GetSize(), reader.GetSpacing(), reader.GetOrigin()))
     return PixelHeader((rows, cols), None if du == dv == 1.0 else (dv, du), (u0, v0))

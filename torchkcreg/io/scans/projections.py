@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchkcreg.io.files import atomic_path, existing_place, physical_memory
+from torchkcreg.plain import first_line
 
 from .image_series import open_series
 from .measured import Projections, check_views, converted
@@ -71,7 +72,7 @@ class ProjectionFile:
         return beam[list(views)] if beam is not None and beam.ndim in (1, 3) and len(beam) == len(self) else beam
 
     def _error(self, error: Exception) -> ValueError:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        reason = first_line(error, line=-1)
         return ValueError(f"projections file {self.path}: {reason}")
 
 

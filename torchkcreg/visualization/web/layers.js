@@ -1,4 +1,5 @@
-// A measured view and the same with the implant: one over the other, blinked, as a checkerboard, or wiped.
+// Measured views and the same with the implant: one over the other, blinked, as a checkerboard, or wiped. The chosen
+// view comes first, and as many after it as fit side by side.
 for (const box of document.querySelectorAll(".layers")) {
   const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), images = [...box.querySelectorAll("img")];
   const field = name => box.querySelector(`[name=${name}]`);
@@ -6,14 +7,24 @@ for (const box of document.querySelectorAll(".layers")) {
 
   function draw() {
     const view = field("view").selectedIndex, mode = field("mode").value, place = Number(field("place").value) / 100;
-    const [under, over] = [images[2 * view], images[2 * view + 1]];
-    if (!under.naturalWidth || !over.naturalWidth) return;
+    const first = images[2 * view];
+    if (!first.naturalWidth) return;
     const ratio = window.devicePixelRatio || 1, most = Math.min(canvas.parentElement.clientWidth - 32, 900);
-    const scale = Math.min(most / under.naturalWidth, Math.min(720, Math.max(320, 0.7 * window.innerHeight)) / under.naturalHeight);
-    const width = Math.round(under.naturalWidth * scale), height = Math.round(under.naturalHeight * scale);
-    canvas.style.width = width + "px"; canvas.style.height = height + "px";
-    canvas.width = width * ratio; canvas.height = height * ratio;
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const scale = Math.min(most / first.naturalWidth, Math.min(720, Math.max(320, 0.7 * window.innerHeight)) / first.naturalHeight);
+    const width = Math.round(first.naturalWidth * scale), height = Math.round(first.naturalHeight * scale), gap = 8;
+    const count = Math.max(1, Math.min(images.length / 2, Math.floor((most + gap) / (width + gap))));
+    const whole = count * (width + gap) - gap;
+    canvas.style.width = whole + "px"; canvas.style.height = height + "px";
+    canvas.width = whole * ratio; canvas.height = height * ratio;
+    for (let k = 0; k < count; k++) {
+      const at = (view + k) % (images.length / 2);
+      pen.setTransform(ratio, 0, 0, ratio, k * (width + gap) * ratio, 0);
+      compare(images[2 * at], images[2 * at + 1], width, height, mode, place);
+    }
+  }
+
+  function compare(under, over, width, height, mode, place) {
+    if (!under.naturalWidth || !over.naturalWidth) return;
     pen.drawImage(mode === "overlay" || (mode === "blink" && shown) ? over : under, 0, 0, width, height);
     if (mode !== "checkerboard" && mode !== "wipe") return;
     pen.save(); pen.beginPath();

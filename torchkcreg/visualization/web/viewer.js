@@ -10,7 +10,7 @@ for (const box of document.querySelectorAll(".viewer")) {
     const x = Math.min(0.9999, Math.max(0, t)) * (ramp.length - 1), i = Math.floor(x), f = x - i;
     return "rgb(" + ramp[i].map((a, k) => Math.round(a + f * (ramp[i + 1][k] - a))).join(",") + ")";
   };
-  let yaw = 0.6, pitch = -0.35, zoom = 1, pointers = new Map(), gap = 0;
+  let yaw = scene.yaw ?? 0.6, pitch = -0.35, zoom = 1, pointers = new Map(), gap = 0;
   const center = [0, 1, 2].map(k => { let s = 0; for (let i = 0; i < n; i++) s += scene.points[3 * i + k]; return s / n; });
   let reach = 1;
   for (let i = 0; i < n; i++) reach = Math.max(reach, Math.hypot(...[0, 1, 2].map(k => scene.points[3 * i + k] - center[k])));
