@@ -146,7 +146,7 @@ def test_bending_is_what_a_rigid_motion_does_not_explain():
     turned = transform_points(
         rigid_matrix(torch.tensor([0.1, 0.2, -0.1]), torch.tensor([1.0, 2.0, 3.0])).double(), points
     )
-    assert bending_of(points, turned) < 1e-9
+    assert bending_of(points, turned) < 1e-5
     bent = points + torch.stack([0 * points[:, 0], 0.001 * (points[:, 2] - 25) ** 2, 0 * points[:, 0]], dim=-1)
     assert 0.2 < bending_of(points, bent) < 0.7
 
