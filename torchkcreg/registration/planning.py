@@ -100,8 +100,8 @@ class ViewInformation:
         order = errors.argsort()[:kept].tolist()
         first = self._exchanged(sets[order[0]], float(errors[order[0]]), allowed)
         ranked = [first, *((sets[place], float(errors[place])) for place in order)]
-        found = {tuple(sorted(self.views[i] for i in places.tolist())): error for places, error in ranked}
-        return [PlannedSet(views, error) for views, error in found.items()][:kept]
+        unique = {tuple(sorted(self.views[i] for i in places.tolist())): error for places, error in ranked}
+        return [PlannedSet(views, error) for views, error in unique.items()][:kept]
 
     def _exchanged(self, views: Tensor, error: float, allowed: Sequence[int]) -> tuple[Tensor, float]:
         while True:

@@ -27,10 +27,10 @@ def find_screws(scene: Scene, assembly: Assembly, data: RegistrationData, *, bin
     return of_best_metal(screws_by_metal(scene, assembly, data, bin=bin))
 
 
-def of_best_metal(found: Sequence[tuple[list[Screw], float]]) -> list[Screw]:
+def of_best_metal(candidates: Sequence[tuple[list[Screw], float]]) -> list[Screw]:
     """The screws of least loss, favouring the first set, which is of the implant's metal."""
-    losses = [loss * (1.0 if number else _OTHER_METAL) for number, (_, loss) in enumerate(found)]
-    return found[losses.index(min(losses))][0]
+    losses = [loss * (1.0 if number else _OTHER_METAL) for number, (_, loss) in enumerate(candidates)]
+    return candidates[losses.index(min(losses))][0]
 
 
 @torch.no_grad()
@@ -51,8 +51,8 @@ def screws_by_metal(
         bin: Detector pixels are averaged in squares of this side.
     """
     search = _Search(scene, assembly, data, bin)
-    found = [search.found_of(metal) for metal in dict.fromkeys([assembly.material, *scene.metals])]
-    return list(zip(found, search.losses(found), strict=True))
+    screws = [search.found_of(metal) for metal in dict.fromkeys([assembly.material, *scene.metals])]
+    return list(zip(screws, search.losses(screws), strict=True))
 
 
 class _Search:

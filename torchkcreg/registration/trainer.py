@@ -49,15 +49,15 @@ def finished(
     gc = similarities(run, GradientCorrelation)  # with uniform pixel weights
     probe = _diagnosed(run, data)
     converged = _converged(history, last) and stopped is None
-    found, deviations = diagnose(probe.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
-    status, reasons = judge(found)
+    diagnostics, deviations = diagnose(probe.objective, gc.tolist(), converged=converged, undone=undone, rival=rival)
+    status, reasons = judge(diagnostics)
     if stopped is not None:
         reasons = [*reasons, f"the registration was ended before its time: {stopped}"]
         status = "doubtful" if status == "ok" else status
     return RegistrationResult(
         implants=[
-            RegisteredImplant.of(assembly, has_material=config.material is not None, deviations=own)
-            for assembly, own in zip(scene, deviations, strict=True)
+            RegisteredImplant.of(assembly, has_material=config.material is not None, deviations=of_implant)
+            for assembly, of_implant in zip(scene, deviations, strict=True)
         ],
         gc=gc,
         history=list(history),
@@ -66,7 +66,7 @@ def finished(
         seed=config.seed,
         status=status,
         warnings=reasons,
-        diagnostics=asdict(found),
+        diagnostics=asdict(diagnostics),
         intensity={name: float(value.detach()) for name, value in scene.intensity.named_parameters()},
         blur_mm=_blur_mm(scene, data),
         view_motions=None if scene.view_motions is None else scene.view_motions.matrices(),

@@ -73,66 +73,68 @@ class Diagnostics:
     view_motion_mm: float | None = None
 
 
-def judge(found: Diagnostics) -> tuple[Status, list[str]]:
+def judge(diagnostics: Diagnostics) -> tuple[Status, list[str]]:
     """The verdict on a registration, and its reasons in words."""
-    failures, doubts = _failures(found), _doubts(found)
+    failures, doubts = _failures(diagnostics), _doubts(diagnostics)
     status: Status = "failed" if failures else "doubtful" if doubts else "ok"
     return status, [*failures, *doubts]
 
 
-def _failures(found: Diagnostics) -> list[str]:
+def _failures(diagnostics: Diagnostics) -> list[str]:
     reasons = []
-    weakest = min(found.gc)
+    weakest = min(diagnostics.gc)
     if not weakest >= _UNRELATED:
         reasons.append(
             f"the implant is not where the images show metal: gradient correlation is {weakest:.2f} in view "
-            f"{found.gc.index(weakest)}, no more than with images of something else (up to {_UNRELATED:g})"
+            f"{diagnostics.gc.index(weakest)}, no more than with images of something else (up to {_UNRELATED:g})"
         )
-    if not found.misfit <= _NOTHING and not found.node_std_mm <= _ANYWHERE_MM:
+    if not diagnostics.misfit <= _NOTHING and not diagnostics.node_std_mm <= _ANYWHERE_MM:
         reasons.append(
-            f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained and the nodes are expected to be "
-            f"off by {found.node_std_mm:.1f} mm (RMS), as with images of something else"
+            f"{100 * diagnostics.misfit:.0f} % of the images' contrast is left unexplained and the nodes are expected "
+            f"to be off by {diagnostics.node_std_mm:.1f} mm (RMS), as with images of something else"
         )
-    if max(found.seen) < _SEEN:
-        reasons.append(f"no view shows more than {100 * max(found.seen):.0f} % of the implant")
-    if found.folds:
+    if max(diagnostics.seen) < _SEEN:
+        reasons.append(f"no view shows more than {100 * max(diagnostics.seen):.0f} % of the implant")
+    if diagnostics.folds:
         reasons.append("the deformation folds over inside the implant")
     return reasons
 
 
-def _doubts(found: Diagnostics) -> list[str]:
+def _doubts(diagnostics: Diagnostics) -> list[str]:
     reasons = []
-    if _UNRELATED <= min(found.gc) < _WEAK:
-        reasons.append(f"the images agree weakly: gradient correlation is {min(found.gc):.2f}, less than {_WEAK:g}")
-    if found.misfit > _UNEXPLAINED:
-        reasons.append(f"{100 * found.misfit:.0f} % of the images' contrast is left unexplained")
-    limit, told, hint = _DEVIATION_MM, "", "views from other sides would help"
-    if found.screws_found:
+    if _UNRELATED <= min(diagnostics.gc) < _WEAK:
+        reasons.append(
+            f"the images agree weakly: gradient correlation is {min(diagnostics.gc):.2f}, less than {_WEAK:g}"
+        )
+    if diagnostics.misfit > _UNEXPLAINED:
+        reasons.append(f"{100 * diagnostics.misfit:.0f} % of the images' contrast is left unexplained")
+    limit, screws, hint = _DEVIATION_MM, "", "views from other sides would help"
+    if diagnostics.screws_found:
         limit, hint = _DEVIATION_FOUND_MM, "their list, or views from other sides would help"
-        told = f" with {found.screws_found} screws that were found, not given"
-    if found.view_motion_mm is not None:
-        hint = f"the views are off the geometry by {found.view_motion_mm:.2f} mm, one that holds would help"
-    if not found.node_std_mm <= limit:
+        screws = f" with {diagnostics.screws_found} screws that were found, not given"
+    if diagnostics.view_motion_mm is not None:
+        hint = f"the views are off the geometry by {diagnostics.view_motion_mm:.2f} mm, a better geometry would help"
+    if not diagnostics.node_std_mm <= limit:
         reasons.append(
-            f"the implant's nodes are expected to be off by {found.node_std_mm:.3f} mm (RMS), more than "
-            f"{limit:g} mm{told}: {hint}"
+            f"the implant's nodes are expected to be off by {diagnostics.node_std_mm:.3f} mm (RMS), more than "
+            f"{limit:g} mm{screws}: {hint}"
         )
-    hardly = [str(view) for view, share in enumerate(found.seen) if share < _HARDLY_SEEN]
-    if hardly and max(found.seen) >= _SEEN:
+    hardly = [str(view) for view, share in enumerate(diagnostics.seen) if share < _HARDLY_SEEN]
+    if hardly and max(diagnostics.seen) >= _SEEN:
         reasons.append(f"less than {100 * _HARDLY_SEEN:.0f} % of the implant is seen in view {', '.join(hardly)}")
-    if found.strain > _YIELD:
-        reasons.append(f"the implant is strained by {100 * found.strain:.2f} % (RMS), more than metal bears")
-    if found.surprise > _SURPRISING:
+    if diagnostics.strain > _YIELD:
+        reasons.append(f"the implant is strained by {100 * diagnostics.strain:.2f} % (RMS), more than metal bears")
+    if diagnostics.surprise > _SURPRISING:
         reasons.append(
-            f"it takes loads {found.surprise**0.5:.1f} times as strong as expected to bend the implant so: it is held "
-            "or shaped otherwise than its finite elements have it; --deformation modes asks for no loads"
+            f"it takes loads {diagnostics.surprise**0.5:.1f} times as strong as expected to bend the implant so: it is "
+            "held or shaped otherwise than its finite elements have it; --deformation modes asks for no loads"
         )
-    if not found.converged:
+    if not diagnostics.converged:
         reasons.append("the last stage did not converge: it needs more iterations")
-    reasons += [f"{name} ended at its bound" for name in found.at_bounds]
-    rival = found.rival
+    reasons += [f"{name} ended at its bound" for name in diagnostics.at_bounds]
+    rival = diagnostics.rival
     if rival and rival.distance_mm > _APART_MM and rival.misfit < _ALIKE * rival.best_misfit:
         reasons.append(f"the implant fits nearly as well {rival.distance_mm:.1f} mm away")
     # That the first stage, on coarse pixels, does not improve on a good start says nothing.
-    reasons += [f"stage {stage} was undone: {why}" for stage, why in found.undone.items() if stage != "1"]
+    reasons += [f"stage {stage} was undone: {why}" for stage, why in diagnostics.undone.items() if stage != "1"]
     return reasons
