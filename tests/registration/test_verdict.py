@@ -41,6 +41,24 @@ def test_each_flaw_alone_is_told(name: str) -> None:
     assert len(reasons) == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("gc", [0.9, float("nan"), 0.9], "failed"),
+        ("gc", [float("nan"), 0.9], "failed"),
+        ("misfit", float("nan"), "failed"),
+        ("strain", float("nan"), "doubtful"),
+        ("surprise", float("inf"), "doubtful"),
+        ("seen", [1.0, float("nan")], "doubtful"),
+        ("view_motion_mm", float("nan"), "doubtful"),
+    ],
+)
+def test_a_figure_that_is_not_a_number_is_never_ok(name: str, value: object, expected: str) -> None:
+    status, reasons = judge(replace(GOOD, **{name: value}))
+    assert status == expected
+    assert f"{name} is not a number" in reasons
+
+
 def test_a_view_that_hardly_shows_the_implant_is_named() -> None:
     status, (reason,) = judge(replace(GOOD, seen=[1.0, 0.1]))
     assert status == "doubtful"

@@ -53,3 +53,16 @@ def test_gradients_agree_with_differences():
 def test_weights_below_zero_are_refused():
     with pytest.raises(ValueError, match="negative"):
         GradientDifference(images(1, 8, 8), weights=-images(1, 8, 8))
+
+
+@pytest.mark.parametrize("bad", [1e5, 1e6, float("inf"), float("nan")])
+def test_what_a_masked_pixel_holds_does_not_matter(bad):
+    generator = torch.Generator().manual_seed(0)
+    fixed, moving = torch.rand(2, 1, 64, 64, generator=generator)
+    mask = torch.ones(1, 64, 64, dtype=torch.bool)
+    mask[0, 3, 3] = False
+    spoiled = fixed.clone()
+    spoiled[0, 3, 3] = bad
+    expected, given = GradientDifference(fixed, mask), GradientDifference(spoiled, mask)
+    assert torch.equal(given(moving), expected(moving))
+    assert float(given(moving)) < 0.9

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -81,7 +82,7 @@ def judge(diagnostics: Diagnostics) -> tuple[Status, list[str]]:
 
 
 def _failures(diagnostics: Diagnostics) -> list[str]:
-    reasons = []
+    reasons = [f"{name} is not a number" for name in _not_numbers(diagnostics, ("gc", "misfit"))]
     weakest = min(diagnostics.gc)
     if not weakest >= _UNRELATED:
         reasons.append(
@@ -100,8 +101,16 @@ def _failures(diagnostics: Diagnostics) -> list[str]:
     return reasons
 
 
+def _not_numbers(diagnostics: Diagnostics, names: tuple[str, ...]) -> list[str]:
+    """Those of the named figures that are NaN or infinite, to which no threshold applies."""
+    values = {name: getattr(diagnostics, name) for name in names}
+    listed = {name: value if isinstance(value, list) else [value] for name, value in values.items()}
+    return [name for name, row in listed.items() if not all(x is None or math.isfinite(x) for x in row)]
+
+
 def _doubts(diagnostics: Diagnostics) -> list[str]:
-    reasons = []
+    figures = ("seen", "strain", "surprise", "view_motion_mm")
+    reasons = [f"{name} is not a number" for name in _not_numbers(diagnostics, figures)]
     if _UNRELATED <= min(diagnostics.gc) < _WEAK:
         reasons.append(
             f"the images agree weakly: gradient correlation is {min(diagnostics.gc):.2f}, less than {_WEAK:g}"

@@ -243,10 +243,11 @@ class GradientDifference(OfGradients):
 
     def __init__(self, fixed: Tensor, mask: Tensor | None = None, weights: Tensor | None = None) -> None:
         super().__init__(fixed, mask, weights)
-        contrast = self._contrast(fixed.detach())
+        seen = fixed.detach() if self.mask is None else torch.where(self.mask, fixed.detach(), 0.0)
+        contrast = self._contrast(seen)
         norms = torch.linalg.vector_norm(contrast, dim=(-2, -1), keepdim=True)
         rounding = 16 * torch.finfo(fixed.dtype).eps * contrast[0, 0].numel() ** 0.5
-        flat = norms <= rounding * largest_value(fixed)[:, None, None, None]
+        flat = norms <= rounding * largest_value(seen)[:, None, None, None]
         self.register_buffer("inverse_norms", torch.where(flat, 0.0, 1 / norms))
         self.register_buffer("unit_gradients", contrast * self.inverse_norms)
 
