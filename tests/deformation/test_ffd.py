@@ -199,3 +199,15 @@ def test_wrong_shapes_are_refused():
         FreeFormDeformation(GRID, labels=torch.zeros(6, 6, 10))
     with pytest.raises(ValueError, match="control_points must have shape"):
         spline_displacement(GRID, torch.zeros(6, 6, 10, 3), torch.zeros(1, 3))
+
+
+def test_a_state_of_another_grid_is_refused_and_one_without_a_grid_is_taken():
+    fine, coarse = (ControlPointGrid((6, 6, 10), (8.75, 8.75, step), torch.eye(4)) for step in (17.5, 25.0))
+    given = FreeFormDeformation(fine, torch.rand(6, 6, 10, 3))
+    same, other = FreeFormDeformation(fine), FreeFormDeformation(coarse)
+    same.load_state_dict(given.state_dict())
+    assert torch.equal(same.control_points, given.control_points.to(same.control_points))
+    with pytest.raises(ValueError, match=r"another grid \(spacing 8.75, 8.75, 17.5 mm\)"):
+        other.load_state_dict(given.state_dict())
+    older = {name: value for name, value in given.state_dict().items() if "extra" not in name}
+    FreeFormDeformation(fine).load_state_dict(older)

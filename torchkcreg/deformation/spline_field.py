@@ -51,6 +51,22 @@ class SplineField(Deformation):
         self.grid = grid
         self.control_points = nn.Parameter(control_points.detach().clone())
         self.register_buffer("labels", labels.long().clone())
+        self.register_load_state_dict_pre_hook(_with_grid)
+
+    def get_extra_state(self) -> Tensor:
+        """Shape, spacing and frame of the grid, in the state dict: control points mean nothing without it."""
+        return torch.tensor(self.description(), dtype=torch.float64, device="cpu")
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Check that a state dict is of this grid.
+
+        Raises:
+            ValueError: If its control points are those of another grid.
+        """
+        own = self.get_extra_state()
+        if state.shape != own.shape or not torch.allclose(state.to(own), own, rtol=1e-9, atol=1e-6):
+            spacing = ", ".join(f"{step:g}" for step in state.flatten()[3:6].tolist())
+            raise ValueError(f"the state is of another grid (spacing {spacing} mm) than this deformation's {self.grid}")
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SplineField:
         super()._apply(fn, recurse)
@@ -125,3 +141,8 @@ class SplineField(Deformation):
     def extra_repr(self) -> str:
         """Shape and spacing of the grid."""
         return f"shape={self.grid.shape}, spacing={self.grid.spacing}"
+
+
+def _with_grid(module: SplineField, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Take state dicts without a grid, such as those of older checkpoints, as of the module's own."""
+    state_dict.setdefault(f"{prefix}_extra_state", module.get_extra_state())
