@@ -160,6 +160,9 @@ def test_compare_of_a_run_with_itself_finds_no_motion_and_writes_table_and_figur
 def test_compare_refuses_what_cannot_be_told(finished, capsys):
     assert main(["compare", str(finished), str(finished), "--loads", "1", "2"]) == 2
     assert "1 loaded runs need as many loads, got 2" in the_error(capsys, "compare")
+    for load in ("0", "nan"):
+        assert main(["compare", str(finished), str(finished), "--loads", load]) == 2
+        assert f"one of them other than 0 N, got {load}" in the_error(capsys, "compare")
     assert main(["compare", str(finished), str(finished), "--plane", "0", "0", "500"]) == 2
     assert "give the plane of the fracture" in the_error(capsys, "compare")
     assert main(["compare", str(finished), str(finished), "--plane", "0", "0"]) == 2

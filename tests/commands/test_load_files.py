@@ -95,7 +95,10 @@ def test_doubts_and_yielding_are_told(body, mesh, tmp_path) -> None:
 def test_runs_that_know_no_load_or_are_of_another_implant_are_refused(body, mesh, tmp_path, capsys) -> None:
     rigid = run_of(tmp_path / "rigid", RigidDeformation())
     assert main(["load", str(rigid), "--implant", str(mesh)]) == 2
-    assert "registered with --deformation rigid, which has no loads" in capsys.readouterr().err
+    assert (
+        "has no loads: its implant was not registered as finite elements; register with --deformation fe"
+        in capsys.readouterr().err
+    )
     assert not (rigid / "load").exists()
     run = run_of(tmp_path / "run", bent(body, 0.02))
     other = run_of(tmp_path / "other", bent(replace(body, holds=body.holds[::-1]), 0.02))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,6 +115,9 @@ def compare_files(
         raise ValueError("nothing to compare with: name a loaded run, or several")
     if loads and len(loads) != len(loaded):
         raise ValueError(f"{len(loaded)} loaded runs need as many loads, got {len(loads)}")
+    if loads and (not all(math.isfinite(load) for load in loads) or not any(loads)):
+        given = ", ".join(f"{load:g}" for load in loads)
+        raise ValueError(f"loads must be finite, and one of them other than 0 N, got {given}")
     if plane is not None and len(plane) not in (3, 6):
         raise ValueError(f"a plane is a point, or a point and a normal: 3 or 6 numbers, got {len(plane)}")
     first, mesh, doubts = _implant(unloaded, name)

@@ -137,7 +137,7 @@ def load_files(
 def _elastic(implant: RegisteredImplant, folder: Path) -> FiniteElementDeformation:
     if not isinstance(implant.deformation, FiniteElementDeformation):
         raise ValueError(
-            f"run folder {folder} was registered with --deformation {implant.deformation.model}, which has no loads: "
+            f"run folder {folder} has no loads: its implant was not registered as finite elements; "
             "register with --deformation fe"
         )
     return implant.deformation
