@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from torchkcreg.geometry import fit_rigid, transform_points
@@ -115,3 +116,8 @@ def test_a_loose_screw_of_an_elastic_case_carries_nothing():
     carried = random_case(draw, elastic=True, counts=_NO_IMAGES).carried
     loose = int((carried.hold_heights - carried.hold_heights.sort().values[draw.holes_used[4]]).abs().argmin())
     assert float(carried.hold_loads[loose].abs().max()) < 1e-3 * float(carried.hold_loads.abs().max())
+
+
+def test_a_loose_screw_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match=r"numbers of the \d screws, got \(9,\)"):
+        random_specimen(replace(draw_case(1), loose=9))

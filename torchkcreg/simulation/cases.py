@@ -16,7 +16,7 @@ from torchkcreg.mechanics import CarriedLoad
 from torchkcreg.physics import Spectrum, line_integrals_from_intensity, tungsten_spectrum
 from torchkcreg.scene import RegistrationData
 
-from .bench.acquisition import Acquisition, acquisitions, views_of
+from .bench.acquisition import Acquisition, acquisitions, panel_of, views_of
 from .bench.loaded import ElasticConstruct, Loaded, loaded
 from .bench.quantities import quantity
 from .bench.recipe import LoadRecipe, PanelRecipe, Recipe
@@ -104,7 +104,7 @@ class SimulatedCase:
             deform=taken.loaded.implant,
             intensity=taken.counts,
             open_beam=recipe.panel.open_beam,
-            saturation=2**recipe.panel.bits - 1,
+            saturation=panel_of(recipe).saturation,
             spectrum=spectrum,
             load=load,
             parts=taken.parts,

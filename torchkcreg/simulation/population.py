@@ -97,6 +97,11 @@ class Draw:
         return self.num_holes * self.pitch + 8.0
 
     @property
+    def bone_y(self) -> float:
+        """Position y of the bone's axis behind the plate, mm."""
+        return -(self.thickness / 2 + _TO_BONE_MM + self.bone_radius)
+
+    @property
     def hole_heights(self) -> list[float]:
         """Heights of the holes on the straight plate, mm."""
         return hole_positions(length=self.length, num_holes=self.num_holes)
@@ -187,14 +192,12 @@ def random_case(
         construct = ElasticConstruct(phantom)
         load = _force(draw, construct)
         phantom = replace(phantom, recipe=phantom.recipe.model_copy(update={"configurations": {"loaded": load}}))
-        construct.specimen = phantom
     geometry, spectrum = view_geometry(draw, views), tungsten_spectrum(draw.kvp)
     return SimulatedCase.of(phantom, geometry, spectrum, construct=construct, counts=counts)
 
 
 def random_specimen(draw: Draw) -> Specimen:
     """The specimen of drawn parameters, with a recipe that bends the plate by the drawn angles."""
-    depth = -(draw.thickness / 2 + _TO_BONE_MM + draw.bone_radius)
     plate = {
         "length": quantity(draw.length, "mm"),
         "width": quantity(draw.width, "mm"),
@@ -206,7 +209,7 @@ def random_specimen(draw: Draw) -> Specimen:
         "flare": draw.flare,
     }
     bone = {
-        "axis": quantity((0.0, depth, 0.0), "mm"),
+        "axis": quantity((0.0, draw.bone_y, 0.0), "mm"),
         "outer_radius": quantity(draw.bone_radius, "mm"),
         "inner_radius": quantity(draw.bone_radius - draw.cortex, "mm"),
         "gap": quantity(_GAP_MM, "mm"),
@@ -302,9 +305,8 @@ def _misalignment(draw: Draw) -> dict[str, str]:
 def _force(draw: Draw, construct: ElasticConstruct) -> LoadRecipe:
     """A force on the upper fragment, mostly along the bone, that stresses the plate to a random share of its yield."""
     rng = np.random.default_rng([draw.seed, 22])
-    depth = -(draw.thickness / 2 + _TO_BONE_MM + draw.bone_radius)
     direction = np.array([*rng.normal(scale=0.15, size=2), -1.0])
-    at = (float(rng.normal(scale=4.0)), depth + float(rng.uniform(-15.0, 15.0)), float(rng.uniform(40.0, 120.0)))
+    at = (float(rng.normal(scale=4.0)), draw.bone_y + float(rng.uniform(-15.0, 15.0)), float(rng.uniform(40.0, 120.0)))
     unit = torch.from_numpy(direction / np.linalg.norm(direction))
     amounts = construct.amounts(unit, torch.tensor(at, dtype=torch.float64))
     surface = torch.from_numpy(np.array(construct.specimen.implant.vertices))

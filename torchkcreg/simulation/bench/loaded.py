@@ -131,14 +131,12 @@ class ElasticConstruct:
             return transform_points(pose, deformation(exact)).reshape(points.shape).to(points)
 
         fragments = {side: pose @ motion_of for side, motion_of in moved.items()}
-        surface = torch.from_numpy(np.array(self.specimen.implant.vertices))
-        moved_surface = motion(surface)
-        screws = [
-            fragments[self.specimen.fragment_of(screw.start[2])]
-            if self.specimen.holds(number)
-            else _near_motion(surface, moved_surface, screw)[0]
-            for number, screw in enumerate(self.specimen.screws)
-        ]
+        screws = [fragments[self.specimen.fragment_of(screw.start[2])] for screw in self.specimen.screws]
+        if loose := self.specimen.recipe.screws.loose:
+            surface = torch.from_numpy(np.array(self.specimen.implant.vertices))
+            moved_surface = motion(surface)
+            for number in loose:
+                screws[number] = _near_motion(surface, moved_surface, self.specimen.screws[number])[0]
         return Loaded(motion, fragments, screws, CarriedLoad.of(self.element, amounts))
 
     def _held(self) -> dict[str, Tensor]:

@@ -111,8 +111,8 @@ def specimen(
         tissue: Mesh from the recipe's tissue file, if it has one.
 
     Raises:
-        ValueError: If a screw is to go into a hole that the implant does not have, the implant's mesh is missing, or a
-            mesh is not closed.
+        ValueError: If a screw is to go into a hole that the implant does not have, a screw that is not there is loose,
+            the implant's mesh is missing, or a mesh is not closed.
     """
     shape = recipe.implant.plate
     if implant is None and shape is not None:
@@ -125,6 +125,8 @@ def specimen(
     holes = sorted(find_holes(implant), key=lambda hole: float(hole.center[2]))
     if screws is None:
         screws = _screws_in_holes(recipe, holes)
+    if any(not 0 <= number < len(screws) for number in recipe.screws.loose):
+        raise ValueError(f"screws.loose must be numbers of the {len(screws)} screws, got {recipe.screws.loose}")
     return Specimen(recipe, implant, holes, screws, bone, tissue)
 
 
