@@ -137,7 +137,7 @@ def test_what_does_not_fit_is_named():
         )
     with pytest.raises(ValueError, match="field of view"):
         fdk(images, geometry, VolumeGrid.centered((4, 4, 4), 1.0, center=(0, 0, 500)))
-    with pytest.raises(ValueError, match=r"cover 120\.0 degrees"):
+    with pytest.raises(ValueError, match="cover 120 degrees"):
         short = circular_geometry(range(0, 120, 2), **PANEL)
         fdk(torch.zeros(60, 44, 56), short, GRID)
 

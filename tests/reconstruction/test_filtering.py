@@ -34,19 +34,19 @@ def test_filtering_is_the_convolution_with_the_sampled_kernel():
     kernel = torch.where(odd, -1 / (math.pi * offsets.double().abs().clamp_min(1) * spacing) ** 2, 0.0)
     kernel += torch.eye(size) / (4 * spacing**2)
     expected = rows @ kernel * spacing
-    assert torch.allclose(filter_rows(rows, spacing, extrapolate=(False, False)), expected, atol=1e-12)
+    assert torch.allclose(filter_rows(rows, spacing, extrapolate=False), expected, atol=1e-12)
 
 
 def test_rows_that_end_in_air_do_not_feel_the_extrapolation():
     rows = torch.zeros(1, 64)
     rows[0, 20:40] = 1.0
-    plain = filter_rows(rows, 1.0, extrapolate=(False, False))
+    plain = filter_rows(rows, 1.0, extrapolate=False)
     assert torch.allclose(filter_rows(rows, 1.0), plain, atol=1e-6)
 
 
 def test_a_truncated_row_gets_no_bright_rim():
     rows = torch.ones(1, 128)
-    rim = filter_rows(rows, 1.0, extrapolate=(False, False))[0, [0, -1]]
+    rim = filter_rows(rows, 1.0, extrapolate=False)[0, [0, -1]]
     assert (rim > 0.1).all()
     assert (filter_rows(rows, 1.0)[0, [0, -1]].abs() < 0.02).all()
 

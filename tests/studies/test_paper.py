@@ -9,9 +9,11 @@ import trimesh
 from torchkcreg.cli import main
 from torchkcreg.geometry import transform_points
 from torchkcreg.io import read_init, read_mesh, write_json
+from torchkcreg.registration import RegistrationConfig
 from torchkcreg.simulation.bench import LoadRecipe, Recipe, loaded, specimen
 from torchkcreg.simulation.bench.standing import parts_in_beam
 from torchkcreg.studies.paper import experiment, femoral_plate, tibial_plate
+from torchkcreg.studies.paper.departures import PAPER, Settings, departures
 from torchkcreg.studies.paper.experiment import bench_model, packaged, registered, simulated, start_of
 from torchkcreg.studies.paper.tibial import _Study, load_table
 
@@ -52,11 +54,28 @@ def test_the_femoral_plate_is_bent_and_titanium_and_its_screws_end_in_a_rod():
     assert (tip[0] - rod.start[0]) ** 2 + (tip[1] - rod.start[1]) ** 2 < rod.radius**2
 
 
+def test_departures_change_one_thing_each_from_the_papers_settings():
+    by_name = departures("steel")
+    paper = RegistrationConfig.of(by_name[PAPER].options)
+    assert not by_name[PAPER].screws and not by_name[PAPER].spectrum and paper.material is None
+    changed = {}
+    for name, settings in by_name.items():
+        config = RegistrationConfig.of(settings.options)
+        assert config.preset == "paper" and [s.groups for s in config.schedule()][2:] == [2, 4, 6, 8, 10]
+        changed[name] = {key for key in type(config).model_fields if getattr(config, key) != getattr(paper, key)}
+    assert changed["screws as components"] == set() and by_name["screws as components"].screws
+    assert changed["polyenergetic DRRs"] == {"material"} and by_name["polyenergetic DRRs"].spectrum
+    assert changed["elastic energy in the objective"] == {"stiffness"}
+    assert changed["control points 17.5 mm apart, as many as needed"] == {"grid_spacing_mm", "grid_grows"}
+    assert changed["places along the plate compared"] == {"stages"}
+    assert changed["implausible stages undone"] == {"undo_stages"}
+
+
 def test_a_finished_registration_is_read_and_not_made_again(monkeypatch, tmp_path):
     (tmp_path / "deformation.json").write_text("{}")
     monkeypatch.setattr(experiment, "register_files", lambda *_args, **_options: pytest.fail("made again"))
     monkeypatch.setattr(experiment, "read_run", lambda folder: f"kept {folder.name}")
-    found = registered(tmp_path, "cfg0", [0], tmp_path, start=tmp_path, options={})
+    found = registered(tmp_path, "cfg0", [0], tmp_path, start=tmp_path, settings=Settings())
     assert found == f"kept {tmp_path.name}"
 
 
@@ -88,7 +107,9 @@ def quick(monkeypatch, tmp_path):
 def test_the_quick_experiment_has_a_table_rows_and_figures(quick):
     out, calls = quick
     table = tibial_plate(out, quick=True, paper=True)
-    assert [call[2] for call in calls] == ["cfg0-3", "cfg0-3-paper", "cfg3-3", "cfg3-3-paper"]
+    names = [call[2] for call in calls]
+    assert names[:4] == ["cfg0-3", "cfg0-3-paper", "cfg3-3", "cfg3-3-paper"]
+    assert "cfg3-3-screws_as_components" in names and len(set(names)) == len(names) == 12
     rows = json.loads((out / "rows.json").read_text())
     still, bent = rows[0], rows[2]
     assert still["beads"] == pytest.approx(still["start"])  # a registration that does nothing is not credited

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,17 +11,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, transform_points
 from torchkcreg.options import Config
 from torchkcreg.projector import backproject_weighted
 
 from .axial_frame import axial_frame, columns_and_rows, is_aligned, rectified
 from .field_of_view import coverage, height_shares, views_by_source
-from .redundancy import AngularSampling, angular_sampling, full_scan_weights, is_offset, parker_weights
+from .redundancy import AngularSampling, angular_sampling, line_weights, unmeasured
 from .scan_views import ViewShard
 
 WINDOWS = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")
 EDGE_PIXELS = 4  # averaged for the value that extends a truncated row, to reduce noise
+NOTICEABLE = 0.002  # share of unmeasured lines that is worth a warning
+UNMEASURED = 0.04  # share that makes FDK wrong
 BLOCK_VIEWS = 16  # filtered together, to bound memory
 Views = Callable[[list[int]], Tensor]  # returns the images of the given views
 
@@ -80,30 +83,35 @@ def filter_rows(
     *,
     window: str = "ram-lak",
     cutoff: float = 1.0,
-    extrapolate: tuple[bool, bool] = (True, True),
+    extrapolate: bool = True,
+    beyond: tuple[int, int] = (0, 0),
 ) -> Tensor:
-    """Ramp-filtered images (..., cols), convolved along their rows; unit of the images per mm.
+    """Ramp-filtered images (..., before + cols + after), convolved along their rows; unit of the images per mm.
 
     Args:
         images: Cosine-weighted projections.
         spacing: Distance between columns at the axis of rotation, mm.
         window: See `ramp_response`.
         cutoff: See `ramp_response`.
-        extrapolate: If true, extend the rows (before the first column, after the last column) by the border's value,
-            falling to 0 along a cosine over half the detector's width. This avoids a bright rim if the object is larger
-            than the detector. Where the border is air nothing changes.
+        extrapolate: If true, extend the rows by the border's value, falling to 0 along a cosine over half the
+            detector's width. This avoids a bright rim if the object is larger than the detector. Where the border is
+            air nothing changes.
+        beyond: Number of columns (before the first, after the last) of the result that the images do not have.
 
     >>> rows = filter_rows(torch.ones(2, 256), 0.5)
     >>> bool(rows[0, 128].abs() < 0.02)
     True
     """
     cols = images.shape[-1]
-    before, after = (cols // 2 if extended else 0 for extended in extrapolate)
-    padded = torch.cat([_tail(images, before).flip(-1), images, _tail(images.flip(-1), after)], -1)
+    extra = cols // 2 if extrapolate else 0
+    padded = torch.cat([_tail(images, extra).flip(-1), images, _tail(images.flip(-1), extra)], -1)
+    more = [max(0, asked - extra) for asked in beyond]
+    padded = pad(padded, (more[0], more[1]))
     length = 1 << max(1, math.ceil(math.log2(2 * padded.shape[-1])))
     response = ramp_response(length, spacing, window=window, cutoff=cutoff, dtype=images.dtype).to(images.device)
     filtered = torch.fft.irfft(torch.fft.rfft(padded, length) * response, length)
-    return filtered[..., before : before + cols].contiguous()
+    first = max(extra, beyond[0]) - beyond[0]
+    return filtered[..., first : first + beyond[0] + cols + beyond[1]].contiguous()
 
 
 def _tail(images: Tensor, extra: int) -> Tensor:
@@ -144,8 +152,9 @@ def fdk(
     `f(x) = sum_v db_v (R / depth_v(x))^2 q_v(u, v)`. Here q is the projection times `R / sqrt(R^2 + p^2 + zeta^2)`
     and the redundancy weight, ramp-filtered along p. The positions p and zeta are in mm on the virtual detector through
     the axis of rotation, and R is the source-to-axis distance. Views may be in any order and at any angles around the
-    world's z axis, over a full turn or a short scan (180 degrees plus the fan angle; Parker weights). The overlap of
-    offset detectors is weighted (full scans only). Tilted detectors are resampled first.
+    world's z axis, over a full turn or less, with gaps, of centred or offset detectors: lines measured twice share
+    their weight (`line_weights`). If more than 0.2 % of the lines at some distance from the axis were never measured,
+    there is a warning. Tilted detectors are resampled first.
 
     With several focal spots (`geometry.sources`) a volume is reconstructed for each; it is exact in the plane of the
     spot. Between the heights of two focal spots their volumes are blended smoothly, each weighted by how completely it
@@ -161,7 +170,8 @@ def fdk(
         backend: Back-projection backend.
 
     Raises:
-        ValueError: If shapes do not match, there are too few angles, values are not finite, or no view sees the grid.
+        ValueError: If shapes do not match, values are not finite, no view sees the grid, or more than 4 % of the lines
+            at some distance from the axis were never measured.
 
     >>> import torch
     >>> from torchkcreg.geometry import VolumeGrid, circular_geometry
@@ -200,9 +210,8 @@ def fdk(
 class _Plan:
     """Weights and filter options of the views of one focal spot.
 
-    `weights` (V, cols) are the product of redundancy weight, angular step and R^2. `padding` is the number of zero
-    columns added before and after the detector's columns, `matrices` are the projection matrices of the padded
-    detector, and `sides` are the sides where truncated rows are extended.
+    `weights` (V, cols) are the product of redundancy weight, angular step and R^2. `beyond` is the number of columns
+    added before and after the detector's columns, and `matrices` are the projection matrices of the wider detector.
     """
 
     radii: Tensor
@@ -210,8 +219,7 @@ class _Plan:
     rows: Tensor
     weights: Tensor
     matrices: Tensor
-    padding: tuple[int, int]
-    sides: tuple[bool, bool]
+    beyond: tuple[int, int]
 
 
 def _single_spot(
@@ -223,11 +231,10 @@ def _single_spot(
     backend: str,
 ) -> Tensor:
     """FDK of the views of one focal spot."""
-    sampling = angular_sampling(axial_frame(geometry).angles.cpu())
     is_tilted, measured = not is_aligned(axial_frame(geometry), geometry.det_shape), geometry
     if is_tilted:
         geometry, resampled = rectified(geometry)
-    plan = _plan(geometry, sampling, config)
+    plan = _plan(geometry, grid)
     views = list(range(geometry.num_views)) if shard is None else shard.views
     volume = None
     for start in range(0, len(views), BLOCK_VIEWS):
@@ -243,37 +250,55 @@ def _single_spot(
     return volume if shard is None else shard.sum(volume)
 
 
-def _plan(geometry: ConeBeamGeometry, sampling: AngularSampling, config: FDKConfig) -> _Plan:
+def _plan(geometry: ConeBeamGeometry, grid: VolumeGrid) -> _Plan:
     frame = axial_frame(geometry)
     columns, rows = columns_and_rows(frame, geometry.det_shape)
     radii = frame.radii[:, None]
-    padding, sides = (0, 0), (config.extrapolate, config.extrapolate)
-    if sampling.full:
-        redundancy = full_scan_weights(columns, radii)
-        if is_offset(columns):
-            # pad the short side: the filtered signal beyond it contributes; no extrapolation there, its weight is 0
-            first, last = -float(columns[0, 0]), float(columns[0, -1])
-            missing = round(abs(abs(first) - abs(last)) / abs(float(columns[0, 1] - columns[0, 0])))
-            near_is_first = abs(first) < abs(last)
-            padding = (missing, 0) if near_is_first else (0, missing)
-            sides = (sides[0] and not near_is_first, sides[1] and near_is_first)
-    else:
-        redundancy = parker_weights(sampling.angles.to(columns), (columns / radii).atan(), sampling.scan_range)
-    weights = redundancy * sampling.steps.to(columns)[:, None] * radii**2
+    sampling, fans = angular_sampling(frame.angles.cpu()), (columns / radii).atan().cpu()
+    _check_coverage(sampling, fans, float(frame.radii.mean()), grid)
+    # the short side of an offset detector: filtered signal beyond it contributes
+    first, last = -float(columns[0, 0]), float(columns[0, -1])
+    missing = round((last - first) / float(columns[0, 1] - columns[0, 0]))
+    beyond = (max(missing, 0), max(-missing, 0))
+    weights = (line_weights(sampling, fans) * sampling.steps[:, None]).to(columns) * radii**2
     matrices = geometry.projection_matrices.clone()
-    matrices[:, 0] += padding[0] * matrices[:, 2]
-    return _Plan(frame.radii, columns, rows, weights, matrices, padding, sides)
+    matrices[:, 0] += beyond[0] * matrices[:, 2]
+    return _Plan(frame.radii, columns, rows, weights, matrices, beyond)
+
+
+def _check_coverage(sampling: AngularSampling, fans: Tensor, radius: float, grid: VolumeGrid) -> None:
+    """Warn or refuse if lines through the grid were never measured."""
+    ends = [torch.tensor([0.0, n - 1], dtype=torch.float64) for n in reversed(grid.shape)]
+    corners = transform_points(grid.voxel_to_world.double(), torch.cartesian_prod(*ends))
+    reach = float(corners[:, :2].abs().amax())  # of the circle in the grid: scans rarely see its corners
+    widest = math.asin(min(1.0, reach / radius))
+    missing, fan = unmeasured(sampling, fans, widest)
+    text = (
+        f"no view measures {100 * missing:.1f} % of the lines at {radius * math.sin(fan):.0f} mm from the axis of "
+        f"rotation: the views cover {sampling.covered_deg:.0f} degrees"
+    )
+    if missing > UNMEASURED:
+        raise ValueError(f"{text}; FDK needs 180 degrees plus the fan angle, or a full turn with an offset detector")
+    if missing > NOTICEABLE:
+        warnings.warn(f"{text}; expect streaks", stacklevel=5)
 
 
 def _filtered(images: Tensor, plan: _Plan, views: list[int], config: FDKConfig) -> Tensor:
-    """Projections (..., v, rows, cols) weighted, ramp-filtered and padded."""
+    """Projections (..., v, rows, cols) weighted, ramp-filtered and widened."""
     columns = plan.columns[views]
     radii = plan.radii[views][:, None, None]
     distance = (radii**2 + columns[:, None] ** 2 + plan.rows[views][:, :, None] ** 2).sqrt()
-    weighted = pad(images * (radii / distance * plan.weights[views][:, None]).to(images), plan.padding)
+    weighted = images * (radii / distance * plan.weights[views][:, None]).to(images)
     pitches = (columns[:, 1:] - columns[:, :-1]).abs().mean(1)
     pitch = float(pitches.mean())
-    filtered = filter_rows(weighted, pitch, window=config.window, cutoff=config.cutoff, extrapolate=plan.sides)
+    filtered = filter_rows(
+        weighted,
+        pitch,
+        window=config.window,
+        cutoff=config.cutoff,
+        extrapolate=config.extrapolate,
+        beyond=plan.beyond,
+    )
     return filtered * (pitch / pitches)[:, None, None].to(images)  # the ramp scales with one over the pitch
 
 

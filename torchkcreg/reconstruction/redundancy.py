@@ -1,4 +1,11 @@
-"""Redundancy of the rays of a circular scan: angular steps, Parker weights, offset detectors."""
+"""Redundancy of the rays of a circular scan: angular steps, and one weight for lines measured once or twice.
+
+A ray at gantry angle b and fan angle g is the same line as the ray at `b + pi - 2 g` and `-g`. With a confidence c that
+falls to 0 at the ends of an arc of views and at the short side of an offset detector, the weight of a ray is
+`c / (c + c')`, where c' is the confidence in its counterpart and 0 if that was not measured. The weights of a line add
+up to 1 for any set of angles and any detector. For a full turn of an offset detector they are those of Wang (2002);
+for a short scan they replace those of Parker (1982).
+"""
 
 from __future__ import annotations
 
@@ -8,9 +15,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-FULL_SCAN_GAP = 1.5  # a largest gap of more than this many typical steps marks the start and end of a short scan
-SHORTEST_SCAN_DEG = 179.0
-OFFSET_SHARE = 0.1  # a detector shifted by at least this share of its width counts as offset
+_GAP = 2.5  # a gap of more than this many steps (their 90th percentile) ends an arc of views
+_TAPER = math.radians(30.0)  # width over which the confidence falls to 0 at the end of an arc
+_OFFSETS = 4.0  # at the short side of a detector it falls over this many times the difference of its sides
+_FANS = 129
 
 
 @dataclass(frozen=True)
@@ -18,101 +26,165 @@ class AngularSampling:
     """Angles and angular steps of the views of one circular scan.
 
     Attributes:
-        angles: (V,) angles from the start of the scan, radians, between 0 and `scan_range`.
-        steps: (V,) angular interval that each view covers, radians; they add up to `scan_range`.
-        scan_range: Angular range of the scan, half a step beyond its ends, radians.
-        full: True for a full turn.
+        angles: (V,) gantry angles, radians, from 0 to 2 pi.
+        steps: (V,) angular interval that each view covers, radians.
+        arcs: (A, 2) start and length of each arc without a gap, radians; empty for a full turn.
     """
 
     angles: Tensor
     steps: Tensor
-    scan_range: float
-    full: bool
+    arcs: Tensor
+
+    @property
+    def full(self) -> bool:
+        """True for a full turn without a gap."""
+        return len(self.arcs) == 0
+
+    @property
+    def covered_deg(self) -> float:
+        """Angle that the views cover, degrees."""
+        return math.degrees(float(self.steps.sum()))
+
+    def confidence(self, angles: Tensor) -> Tensor:
+        """Confidence in views at any angles in radians: 0 in a gap, 1 deep inside an arc; shape of `angles`."""
+        if self.full:
+            return torch.ones_like(angles)
+        arcs = self.arcs.to(angles)
+        after = (angles[..., None] - arcs[:, 0]) % (2 * math.pi)
+        taper = (arcs[:, 1] / 2).clamp(max=_TAPER)
+        inside = torch.minimum(after, arcs[:, 1] - after).clamp_min(0) / taper
+        return (torch.sin(math.pi / 2 * inside.clamp(max=1)) ** 2).amax(-1)
 
 
 def angular_sampling(angles: Tensor) -> AngularSampling:
     """Angular sampling of views at gantry angles (V,) in radians, in any order and over any number of turns.
 
-    The largest gap between neighbours distinguishes a short scan, which starts after that gap, from a full scan, which
-    has no conspicuous gap.
+    A view covers half the way to its neighbours. A gap much wider than the others ends an arc; its last view then
+    covers half a usual step of it.
 
     Raises:
-        ValueError: If there are fewer than 3 views or they cover less than half a turn.
+        ValueError: If there are fewer than 3 views.
 
     >>> sampling = angular_sampling(torch.arange(0.0, 200.0).deg2rad())
-    >>> sampling.full, round(math.degrees(sampling.scan_range), 3)
+    >>> sampling.full, round(sampling.covered_deg, 3)
     (False, 200.0)
     """
-    num_views = len(angles)
-    if num_views < 3:
-        raise ValueError(f"a scan needs at least 3 views, got {num_views}")
+    if len(angles) < 3:
+        raise ValueError(f"a scan needs at least 3 views, got {len(angles)}")
     turned = angles.double() % (2 * math.pi)
     order = torch.argsort(turned, stable=True)
-    ordered = turned[order]
-    gaps = torch.cat([ordered[1:] - ordered[:-1], (ordered[:1] + 2 * math.pi - ordered[-1:])])
-    widest = int(gaps.argmax())
-    inner = torch.cat([gaps[:widest], gaps[widest + 1 :]])
-    usual = float(inner[inner > 1e-9].median()) if bool((inner > 1e-9).any()) else float(gaps[widest])
-    full = float(gaps[widest]) <= FULL_SCAN_GAP * usual
-    order, gaps = order.roll(-widest - 1), gaps.roll(-widest - 1)  # the last gap is now the widest
-    if not full:
-        gaps[-1] = usual
-    before, after = gaps.roll(1), gaps
+    after = turned[order].roll(-1) - turned[order]  # from each view to the next
+    after[-1] += 2 * math.pi
+    apart = after[after > 1e-9]
+    ends = after > _GAP * apart.quantile(0.9, interpolation="lower")
+    if bool(ends.any()):
+        after[ends] = apart[apart <= _GAP * apart.quantile(0.9, interpolation="lower")].median()
+    before = after.roll(1)
     steps = torch.empty_like(turned)
     steps[order] = (before + after) / 2
-    start = turned[order[0]] - before[0] / 2
-    scan_range = float(steps.sum())
-    if not full and math.degrees(scan_range) < SHORTEST_SCAN_DEG:
-        raise ValueError(f"the views cover {math.degrees(scan_range):.1f} degrees, FDK needs 180 plus the fan angle")
-    return AngularSampling((turned - start) % (2 * math.pi), steps, scan_range, full)
+    first = ends.roll(1).nonzero()[:, 0]
+    starts = turned[order][first] - before[first] / 2
+    last = ends.nonzero()[:, 0]
+    stops = turned[order][last] + after[last] / 2
+    if len(first) and int(first[0]) > int(last[0]):  # the arc before the first gap began before angle 0
+        stops = stops.roll(-1)
+    arcs = torch.stack([starts, (stops - starts) % (2 * math.pi)], dim=1)
+    return AngularSampling(turned, steps, arcs)
 
 
-def parker_weights(angles: Tensor, fan_angles: Tensor, scan_range: float) -> Tensor:
-    """Parker weights (V, cols) of a short scan: each line counts once (Parker 1982).
+@dataclass(frozen=True)
+class Fans:
+    """Fan angles that the detector sees in each view.
 
-    The ray at gantry angle b and fan angle g is measured again, backwards, at `b + pi - 2 g` and `-g`. With
-    `d = (scan_range - pi) / 2` the weight rises as `sin^2(pi/4 b / (d + g))` while `b < 2 (d + g)`, falls as
-    `sin^2(pi/4 (pi + 2 d - b) / (d - g))` where `b > pi + 2 g`, and is 1 between. Outside a fan of +-d,
-    rays measured once have weight 1; rays that were never measured are missing and are not compensated.
+    Attributes:
+        low: (V,) fan angle of the detector's edge on the side of falling gantry angle, radians.
+        high: (V,) fan angle of its other edge.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    @classmethod
+    def of(cls, fan_angles: Tensor) -> Fans:
+        """Edges of detectors whose columns lie at fan angles (V, cols), radians."""
+        half = (fan_angles[:, 1:] - fan_angles[:, :-1]).abs().mean(1) / 2
+        return cls(fan_angles.amin(1) - half, fan_angles.amax(1) + half)
+
+    def confidence(self, views: Tensor, fan_angles: Tensor) -> Tensor:
+        """Confidence in rays at fan angles of the views with the given numbers: 0 beyond the detector."""
+        low, high = self.low[views], self.high[views]
+        short, long = torch.minimum(-low, high), torch.maximum(-low, high)
+        toward_long = torch.where(high > -low, fan_angles, -fan_angles)
+        taper = torch.minimum(2 * short, _OFFSETS * (long - short))
+        rise = ((toward_long + short) / taper.clamp_min(1e-12)).clamp(0, 1)
+        risen = torch.where(taper > 1e-12, torch.sin(math.pi / 2 * rise) ** 2, torch.ones_like(rise))
+        inside = (fan_angles >= low) & (fan_angles <= high)
+        return torch.where(inside, risen, torch.zeros_like(risen))
+
+
+def line_weights(sampling: AngularSampling, fan_angles: Tensor) -> Tensor:
+    """Weights (V, cols) of the rays of a scan: the measurements of a line add up to one line.
+
+    Where some of the lines at a distance from the axis were never measured, the others are weighted up for them, so
+    that levels stay right; see `unmeasured`.
 
     Args:
-        angles: (V,) angles from the start of the scan, radians.
-        fan_angles: (V, cols) or (cols,), radians, positive towards increasing gantry angle.
-        scan_range: Angular range of the scan, between pi and 2 pi.
+        sampling: Angles of the views.
+        fan_angles: (V, cols), radians, positive towards increasing gantry angle.
 
-    >>> at_the_start = parker_weights(torch.tensor([0.0, 1.5]), torch.zeros(1), math.pi + 0.2)
-    >>> at_the_start.flatten().tolist()
-    [0.0, 1.0]
+    >>> turn = angular_sampling(torch.arange(0.0, 360.0).deg2rad())
+    >>> line_weights(turn, torch.linspace(-0.2, 0.2, 3).expand(360, 3))[0].tolist()
+    [0.5, 0.5, 0.5]
     """
-    beyond = (scan_range - math.pi) / 2
-    b, g = torch.broadcast_tensors(angles[:, None], fan_angles)
-    tiny = 1e-12
-    rise = torch.sin(math.pi / 4 * b / (beyond + g).clamp_min(tiny)) ** 2
-    fall = torch.sin(math.pi / 4 * (math.pi + 2 * beyond - b) / (beyond - g).clamp_min(tiny)) ** 2
-    weights = torch.where(b < 2 * (beyond + g), rise, torch.ones_like(b))
-    return torch.where(b > math.pi + 2 * g, fall, weights)
+    fans = Fans.of(fan_angles)
+    grid, measured = _measured(sampling, fans)
+    weights = _weights(sampling, fans, fan_angles)
+    return weights / _interpolated(measured.clamp_min(1e-3), grid, fan_angles.abs())
 
 
-def full_scan_weights(positions: Tensor, radius: float | Tensor) -> Tensor:
-    """Weights (..., cols) of a full scan: 0.5 for each of the two measurements of a line.
-
-    With a detector offset by a tenth of its width or more, the lines on one side are measured only once. The weight
-    then rises smoothly across the part measured twice, from 0 at the short end to 1 (Wang 2002).
+def unmeasured(sampling: AngularSampling, fan_angles: Tensor, widest: float) -> tuple[float, float]:
+    """Largest share of the lines at one distance from the axis that no ray measures, and its fan angle in radians.
 
     Args:
-        positions: Column positions relative to the central ray, at the axis of rotation, (..., cols), mm.
-        radius: Source-to-axis distance, mm.
+        sampling: Angles of the views.
+        fan_angles: (V, cols), radians.
+        widest: Lines at larger fan angles do not count: they miss the volume.
     """
-    if not is_offset(positions):
-        return torch.full_like(positions, 0.5)
-    low, high = float(positions.min()), float(positions.max())
-    overlap = min(-low, high)
-    toward_long_side = positions if high > -low else -positions
-    share = (toward_long_side / radius).atan() / math.atan(overlap / float(torch.as_tensor(radius).mean()))
-    return 0.5 + 0.5 * torch.sin(math.pi / 2 * share.clamp(-1, 1))
+    grid, measured = _measured(sampling, Fans.of(fan_angles))
+    missing = (1 - measured)[grid <= max(widest, float(grid[1]))]
+    worst = int(missing.argmax())
+    return float(missing[worst]), float(grid[worst])
 
 
-def is_offset(positions: Tensor) -> bool:
-    """True if columns at these positions (mm) belong to an offset detector that still contains the central ray."""
-    low, high = float(positions.min()), float(positions.max())
-    return low < 0 < high and abs(low + high) >= OFFSET_SHARE * (high - low)
+def _weights(sampling: AngularSampling, fans: Fans, fan_angles: Tensor) -> Tensor:
+    """Weights (V, n) of rays at fan angles (V, n), 0 beyond the detector."""
+    views = torch.arange(len(fan_angles))[:, None].expand(fan_angles.shape)
+    angles = sampling.angles.to(fan_angles)[:, None]
+    here = sampling.confidence(angles) * fans.confidence(views, fan_angles)
+    opposite = (angles + math.pi - 2 * fan_angles) % (2 * math.pi)
+    there = sampling.confidence(opposite) * fans.confidence(_nearest(sampling.angles, opposite), -fan_angles)
+    return here / (here + there).clamp_min(torch.finfo(here.dtype).tiny)
+
+
+def _measured(sampling: AngularSampling, fans: Fans) -> tuple[Tensor, Tensor]:
+    """Fan angles from 0 to the widest, and the share of the lines at each that was measured."""
+    widest = float(torch.maximum(-fans.low, fans.high).median())
+    grid = torch.linspace(0, widest, _FANS, dtype=torch.float64) * (1 - 1e-9)
+    both = [_weights(sampling, fans, (side * grid).expand(len(fans.low), _FANS)) for side in (1, -1)]
+    return grid, (sampling.steps[:, None] * (both[0] + both[1])).sum(0) / (2 * math.pi)
+
+
+def _nearest(angles: Tensor, asked: Tensor) -> Tensor:
+    """Number of the view whose angle (V,), from 0 to 2 pi, is nearest to each asked angle."""
+    ordered, order = angles.sort()
+    around = torch.cat([ordered[-1:] - 2 * math.pi, ordered, ordered[:1] + 2 * math.pi]).to(asked)
+    middles = (around[1:] + around[:-1]) / 2
+    return order.roll(1)[torch.searchsorted(middles, asked.contiguous()) % len(order)]
+
+
+def _interpolated(values: Tensor, grid: Tensor, asked: Tensor) -> Tensor:
+    """Linear interpolation of values on a regular grid from 0 on; constant beyond its end."""
+    place = (asked / grid[1]).clamp(max=len(grid) - 1)
+    below = place.long().clamp(max=len(grid) - 2)
+    share = place - below
+    return values[below] * (1 - share) + values[below + 1] * share

@@ -67,7 +67,9 @@ def deformation_of(implant: Implant, config: RegistrationConfig) -> Deformation:
         return finite_elements(implant, config)
     if implant.rest is not None:
         raise ValueError("a shape without load is what finite elements bend: ask for them with --deformation fe")
-    grid = default_grid(implant.cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm)
+    grid = default_grid(
+        implant.cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm, grows=config.grid_grows
+    )
     return FreeFormDeformation(grid, prior=config.bending_prior)
 
 

@@ -95,19 +95,22 @@ def default_grid(
     *,
     shape: tuple[int, int, int] = (6, 6, 10),
     spacing: tuple[float, float, float] = (8.75, 8.75, 25.0),
+    grows: bool = True,
 ) -> ControlPointGrid:
     """Grid centred on an implant, along its principal axes, the shortest first and the longest last.
 
     It has enough CPs that the implant lies in the valid domain with a margin of one spacing on each side, and at least
-    `shape`. The defaults are those of Cao et al. (2020).
+    `shape`. The defaults of shape and spacing are those of Cao et al. (2020).
 
     Args:
         points: Nodes of the implant in its frame, mm, shape (N, 3).
         shape: Smallest number of CPs along each axis.
         spacing: Spacing of the CPs, mm.
+        grows: If False, the grid has exactly `shape` CPs. Parts of the implant outside the valid domain, at most one
+            spacing long, then move with virtual CPs, see `spline_displacement`.
 
     Raises:
-        ValueError: If there is no point, or one is not finite.
+        ValueError: If there is no point, or one is not finite; if the implant is longer than a grid that may not grow.
 
     Example:
         >>> grid = default_grid(torch.rand(1000, 3) * torch.tensor([160.0, 4.0, 12.0]))
@@ -122,10 +125,16 @@ def default_grid(
     low, high = along.amin(0), along.amax(0)
     counts = [
         # n CPs have a valid domain of n - 3 spacings, which must cover the extent and a spacing on either side.
-        max(int(least), math.ceil(extent / step - 1e-9) + 5)
+        max(int(least), math.ceil(extent / step - 1e-9) + 5) if grows else int(least)
         for least, extent, step in zip(shape, (high - low).tolist(), spacing, strict=True)
     ]
     size = points.new_tensor([(n - 1) * s for n, s in zip(counts, spacing, strict=True)])
+    if bool((high - low > size + 1e-6).any()):
+        extent, span = (" x ".join(f"{length:.0f}" for length in lengths.tolist()) for lengths in (high - low, size))
+        raise ValueError(
+            f"the implant, {extent} mm, is longer than the grid of {' x '.join(map(str, counts))} control points, "
+            f"{span} mm: give more (grid_shape) or let the grid grow (grid_grows)"
+        )
     frame = torch.eye(4, dtype=torch.float64, device=points.device)
     frame[:3, :3] = axes
     frame[:3, 3] = axes @ ((low + high - size) / 2)

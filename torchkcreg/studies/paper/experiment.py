@@ -26,8 +26,9 @@ from torchkcreg.registration import RegistrationResult
 from torchkcreg.simulation.bench import Recipe
 from torchkcreg.visualization import overlay_figure, series_figure
 
+from .departures import Settings
+
 _PITCH_MM = 0.8
-PAPER_SETTINGS = {"preset": "paper", "deformation": "ffd", "find_screws": False, "view_motion": "off"}
 _START_DEG, _START_MM = (0.8, -0.6, 1.0), (1.0, -1.2, 0.8)  # error of the start pose
 
 
@@ -114,8 +115,7 @@ def registered(
     run: Path,
     *,
     start: Path,
-    options: Mapping[str, Any],
-    known: bool = True,
+    settings: Settings,
     implant: Path | None = None,
 ) -> RegistrationResult:
     """Register a configuration in its run folder. A finished run is read; an interrupted run is resumed.
@@ -126,8 +126,7 @@ def registered(
         views: Indices of the case's views that are used.
         run: Run folder.
         start: File of the start pose.
-        options: Options of the registration.
-        known: Give screws and spectrum to the registration.
+        settings: Options of the registration, and what it is given.
         implant: File of an implant model to use instead of the case's.
     """
     if (run / "deformation.json").exists():
@@ -136,12 +135,12 @@ def registered(
         implant=implant or case / "implant.stl",
         geometry=case / "geometry.json",
         projections=case / f"{configuration}.npz",
-        spectrum=case / "spectrum.csv" if known else None,
-        components=case / "screws.json" if known else None,
+        spectrum=case / "spectrum.csv" if settings.spectrum else None,
+        components=case / "screws.json" if settings.screws else None,
         init=start,
         views=views,
     )
-    return register_files(files, run, overrides=dict(options), resume=run.exists())
+    return register_files(files, run, overrides=dict(settings.options), resume=run.exists())
 
 
 def seconds_of(folder: Path) -> float:

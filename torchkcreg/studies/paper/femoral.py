@@ -18,7 +18,8 @@ from torchkcreg.physics import material
 from torchkcreg.simulation.bench import Recipe
 from torchkcreg.visualization import reconstruction_figure
 
-from .experiment import PAPER_SETTINGS, ViewSets, packaged, reconstructed, registered, seconds_of, simulated, start_of
+from .departures import PAPER, Settings, departures
+from .experiment import ViewSets, packaged, reconstructed, registered, seconds_of, simulated, start_of
 
 CONFIGURATION = "deformed"
 _METHODS = {"FDK": "fdk", "PWLS": "pwls", "KC-Rec": "kcrec"}
@@ -48,20 +49,19 @@ def femoral_plate(out: Path, *, quick: bool = False, known: bool = True, paper: 
     out, content, sets = Path(out), packaged("femoral_plate"), ViewSets.of_paper(quick=quick)
     imaged = {"views": sets.imaged, "binning": 2 if quick else 1, "cols": 384}
     case = simulated(content, out / "views", scanner=imaged)
-    start, options = start_of(out), {"material": content["implant"]["material"]}
+    start, metal = start_of(out), content["implant"]["material"]
     jobs = [(number, False) for number in sorted(sets.views)] + ([(3, True)] if paper else [])
     rows = []
     for number, paper_settings in jobs:
         run = out / "runs" / f"{CONFIGURATION}-{number}{'-paper' if paper_settings else ''}"
-        chosen = PAPER_SETTINGS if paper_settings else options
+        default = Settings({"material": metal}, screws=known, spectrum=known)
         result = registered(
             case,
             CONFIGURATION,
             sets.places(number),
             run,
             start=start,
-            options=chosen,
-            known=known and not paper_settings,
+            settings=departures(metal)[PAPER] if paper_settings else default,
         )
         figures = out / f"evaluation-{run.name}"
         shape = evaluate_files(run, reference=case / f"{CONFIGURATION}_implant.stl", figures=figures).shape

@@ -18,8 +18,8 @@ from torchkcreg.io import read_init, read_json, read_volume, write_json, write_t
 from torchkcreg.registration import RegistrationResult
 from torchkcreg.simulation.bench import LoadRecipe
 
+from .departures import PAPER, Settings, departures
 from .experiment import (
-    PAPER_SETTINGS,
     ViewSets,
     bench_model,
     draw_series,
@@ -31,7 +31,8 @@ from .experiment import (
     start_of,
 )
 
-CAD, BENCH, PAPER = "CAD", "bench scan", "paper's settings"
+CAD, BENCH = "CAD", "bench scan"
+_DEPARTED = "cfg3"
 _QUICK_LOADS = ("cfg0", "cfg3")
 _NEAR_MM = 4.0  # search radius around the expected position of a bead
 _SCAN_VOXELS: dict[str, Any] = {"spacing_mm": 0.5, "size_mm": (40.0, 32.0, 196.0)}
@@ -45,7 +46,7 @@ class LoadRow:
     Attributes:
         configuration: Name of the configuration.
         load_n: Axial force, N.
-        model: Model of the implant: its CAD file, its bench scan, or the CAD file with the paper's settings.
+        model: Model of the implant: its CAD file, its bench scan, or the CAD file with settings of `departures`.
         views: Number of views.
         start: Error of the beads at the start pose.
         beads: Error of the beads against their simulated positions.
@@ -81,8 +82,8 @@ def tibial_plate(out: Path, *, quick: bool = False, known: bool = True, paper: b
         out: Output folder, created if missing.
         quick: Two loads, three binned views, no FDK and no bench scan: takes two minutes.
         known: Give screws and spectrum to the registration.
-        paper: Also register three views with the paper's settings: plain path lengths, gradient correlation, CMA-ES of
-            40 x 400 from two to ten groups of control points. Takes minutes for each load.
+        paper: Also register three views with the paper's settings, and one load with each departure from them, see
+            `departures`. Takes an hour.
 
     Raises:
         FileExistsError: If the folder holds another experiment.
@@ -114,6 +115,11 @@ class _Study:
         if self.quick:
             content["configurations"] = {name: content["configurations"][name] for name in _QUICK_LOADS}
         return content
+
+    @cached_property
+    def departures(self) -> dict[str, Settings]:
+        """The paper's settings and each departure from them, by name."""
+        return departures(self.content["implant"]["material"])
 
     @cached_property
     def sets(self) -> ViewSets:
@@ -159,21 +165,20 @@ class _Study:
             if name == names[-1] and not self.quick:
                 yield name, 3, BENCH
             if paper:
-                yield name, 3, PAPER
+                yield from ((name, 3, model) for model in self.departures if model == PAPER or name == _DEPARTED)
 
     def row(self, configuration: str, number: int, model: str) -> LoadRow:
         """Run one registration and return its errors."""
-        paper_settings = model == PAPER
-        name = f"{configuration}-{number}" + {CAD: "", BENCH: "-bench", PAPER: "-paper"}[model]
-        run = self.out / "runs" / name
+        known = Settings({"material": self.content["implant"]["material"]}, screws=self.known, spectrum=self.known)
+        suffix = {CAD: "", BENCH: "-bench", PAPER: "-paper"}.get(model, f"-{model.replace(' ', '_')}")
+        run = self.out / "runs" / f"{configuration}-{number}{suffix}"
         result = registered(
             self.case,
             configuration,
             self.sets.places(number),
             run,
             start=self.start,
-            options=PAPER_SETTINGS if paper_settings else {"material": self.content["implant"]["material"]},
-            known=self.known and not paper_settings,
+            settings=self.departures.get(model, known),
             implant=self.bench if model == BENCH else None,
         )
         if model == CAD and number == 3:
