@@ -1,5 +1,7 @@
 import json
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,9 +16,9 @@ from torchkcreg.commands import (
     registered_components,
 )
 from torchkcreg.commands.reconstruct import resolve_options
-from torchkcreg.commands.reconstruct_inputs import read_reconstruction_inputs
+from torchkcreg.commands.reconstruct_inputs import _completed, read_reconstruction_inputs
 from torchkcreg.geometry import circular_geometry
-from torchkcreg.io import RunFolder, read_volume, write_geometry, write_projections
+from torchkcreg.io import RunFolder, read_config, read_volume, write_geometry, write_projections
 from torchkcreg.physics import Beam, material, tungsten_spectrum
 from torchkcreg.reconstruction import component_path_lengths
 from torchkcreg.simulation.solids import Sphere
@@ -248,3 +250,55 @@ def test_scatter_may_be_what_the_registration_found(ball_scan, small_run, tmp_pa
         means[scatter] = float(volume[grid.points().norm(dim=-1) < 14].mean())
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())["scatter"]["mean_of_run"]
     assert found > 0 and means["run"] > means["none"]  # less signal is primary: the ball is denser
+
+
+def test_a_registration_and_a_reconstruction_do_not_take_each_others_folder(ball_scan, small_run, small_case, tmp_path):
+    taken = tmp_path / "run"
+    shutil.copytree(small_run, taken)
+    before = sorted(path.name for path in taken.iterdir())
+    with pytest.raises(FileExistsError, match="holds a registration, no reconstruction"):
+        main_or_raise(arguments(ball_scan, taken, "--method", "fdk", "--overwrite"))
+    assert sorted(path.name for path in taken.iterdir()) == before
+    main_or_raise(arguments(ball_scan, tmp_path / "rec", "--method", "fdk"))
+    files = RegistrationFiles(
+        implant=small_case / "implant.stl",
+        geometry=small_case / "geometry.json",
+        projections=small_case / "projections.npz",
+        config=small_case / "quick.yaml",
+    )
+    with pytest.raises(FileExistsError, match="holds a reconstruction, no registration"):
+        register_files(files, tmp_path / "rec", overwrite=True, figures=False)
+    assert (tmp_path / "rec" / "volume.mha").exists()
+
+
+def main_or_raise(words):
+    """Run the command line; its error is raised instead of printed."""
+    assert main([*words, "--debug"]) == 0
+
+
+def test_the_open_beam_of_a_run_is_not_that_of_another_scan(ball_scan, small_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(small_run, run)
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("files:\n", "files:\n  open_beam: 45000.0\n", 1))
+    options = ReconstructionOptions(method="fdk", scatter="none", spacing_mm=8.0)
+    alone = ReconstructionFiles(geometry=ball_scan / "geometry.json", projections=ball_scan / "projections.npz")
+    lines = [read_reconstruction_inputs(files, options).transmission for files in (alone, replace(alone, run=run))]
+    assert torch.equal(*lines)
+    assert _completed(ReconstructionFiles(run=run)).open_beam == 45000.0
+    named = small_case_projections(run)
+    assert _completed(ReconstructionFiles(run=run, projections=named)).open_beam == 45000.0
+
+
+def small_case_projections(run):
+    """Path of the projections that a run was made of."""
+    return Path(read_config(run / "config.yaml")["files"]["projections"])
+
+
+def test_a_reconstruction_says_which_voxels_are_seen_from_all_sides(ball_scan, tmp_path):
+    main_or_raise(
+        arguments(ball_scan, tmp_path / "rec", "--method", "fdk", "--spacing", "4", "--size", "140", "140", "8")
+    )
+    seen, _ = read_volume(tmp_path / "rec" / "measured.mha")
+    middle = seen[seen.shape[0] // 2]
+    assert middle[17, 17] == 1 and middle[0, 0] == 0 and middle[17, 0] == 0

@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
+from torchkcreg.cli import main
 from torchkcreg.commands import RegistrationFiles, register_files, resolve_config
 from torchkcreg.io import read_config, read_run
 from torchkcreg.registration import Callback
@@ -81,3 +84,33 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_written(files,
     with pytest.raises(ValueError, match="backend must be one of auto, cpp, triton, torch, got 'fast'"):
         register_files(files, tmp_path / "run", overrides={"backend": "fast"})
     assert not (tmp_path / "run").exists()
+
+
+def test_a_runs_configuration_repeats_it_files_and_views_and_all(files, tmp_path):
+    first = register_files(
+        replace(files, views=[0, 2]), tmp_path / "run", overrides={"material": "steel"}, figures=False
+    )
+    config = tmp_path / "run" / "config.yaml"
+    assert main(["register", f"--config={config}", f"--out={tmp_path / 'again'}", "--no-figures"]) in (0, 3)
+    again = read_run(tmp_path / "again")
+    assert len(again.gc) == 2 and again.config == first.config
+    assert torch.equal(again.implant_to_world, first.implant_to_world)
+    assert RegistrationFiles.of({"config": config, "views": [1]}).views == [1]
+
+
+def test_a_registration_without_its_files_says_which(tmp_path, files, capsys):
+    (tmp_path / "options.yaml").write_text("beta: 0.25\n")
+    with pytest.raises(ValueError, match="needs --geometry, --projections"):
+        RegistrationFiles.of({"config": tmp_path / "options.yaml", "implant": files.implant, "geometry": None})
+
+
+def test_a_new_result_has_nothing_of_an_old_one_beside_it(files, tmp_path):
+    run = tmp_path / "run"
+    register_files(files, run, figures=False)
+    (run / "load").mkdir()
+    for name in ("geometry_corrected.json", "load/load.json"):
+        (run / name).write_text("{}")
+    (run / "load" / "mine.txt").write_text("")
+    register_files(files, run, overwrite=True, figures=False)
+    assert not (run / "geometry_corrected.json").exists() and not (run / "load" / "load.json").exists()
+    assert (run / "load" / "mine.txt").exists()

@@ -157,3 +157,9 @@ def test_the_3d_view_opens_nearly_face_on():
     scene = implant_scene(plate, torch.zeros_like(plate), torch.zeros(500))
     off = (scene["yaw"] - 0.5) % math.pi
     assert min(off, math.pi - off) < 0.05
+
+
+def test_a_folder_with_pictures_alone_is_no_result(tmp_path, capsys):
+    (tmp_path / "holiday.png").write_bytes(b"")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "holds no results" in capsys.readouterr().err

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from torchkcreg.cli import main
+from torchkcreg.commands import densitometry_files
 from torchkcreg.evaluation import mineral_content
 from torchkcreg.geometry import VolumeGrid
-from torchkcreg.io import write_json, write_volume
+from torchkcreg.io import read_volume, write_json, write_volume
 from torchkcreg.physics import calcium_in_water, calcium_of
 
 GRID = VolumeGrid.centered((10, 20, 20), 1.0)
@@ -30,6 +31,7 @@ def folder(tmp_path):
     metal[:, 8:12, 9:11] = 0.4
     write_volume(tmp_path / "volume.mha", volume, GRID)
     write_volume(tmp_path / "with_implant.mha", volume + metal, GRID)
+    write_volume(tmp_path / "measured.mha", torch.ones(GRID.shape, dtype=torch.uint8), GRID)
     write_json(tmp_path / "metrics.json", {"reference_kev": KEV, "water": attenuation(0.0)})
     return tmp_path
 
@@ -50,7 +52,7 @@ def test_regions_are_measured_away_from_metal(folder, capsys):
     assert 0 < bone["left_out"] < 0.3 and water["left_out"] == 0
     assert (folder / "densitometry" / "densitometry.png").stat().st_size > 1000
     printed = capsys.readouterr().out
-    assert "cylinder 1" in printed and "too near to metal" in printed
+    assert "cylinder 1" in printed and "left out" in printed
 
 
 def test_a_label_map_names_regions(folder):
@@ -88,3 +90,38 @@ def test_what_cannot_be_measured_is_refused(folder, capsys):
     holes = torch.full(GRID.shape, float("nan"))
     with pytest.raises(ValueError, match="not finite"):
         mineral_content(holes, {"a": torch.ones(GRID.shape)}, GRID)
+
+
+def test_what_lies_beyond_the_volume_is_left_out_and_said(folder):
+    with pytest.warns(UserWarning, match=r"cylinder 1: 7\d % lies beyond the volume, .* left out"):
+        (content,) = densitometry_files(folder, folder / "d", cylinders=[(5, 0, 1, 5, 0, 17, 4)], figures=False)
+    assert content.left_out == pytest.approx(0.75, abs=0.03)
+    assert content.calcium_mg_ml == pytest.approx(120, abs=0.1)
+
+
+def test_what_is_not_seen_from_all_sides_is_left_out_and_said(folder):
+    seen = torch.ones(GRID.shape, dtype=torch.uint8)
+    seen[:, :, 14:] = 0
+    volume, _ = read_volume(folder / "volume.mha")
+    volume[:, :, 14:] = 0.0
+    write_volume(folder / "measured.mha", seen, GRID)
+    write_volume(folder / "volume.mha", volume, GRID)
+    with pytest.warns(UserWarning, match="% is not seen from all sides"):
+        (content,) = densitometry_files(folder, folder / "d", cylinders=[(5, 0, -4, 5, 0, 4, 3)], figures=False)
+    assert content.calcium_mg_ml == pytest.approx(120, abs=0.1) and 0.3 < content.left_out < 0.9
+
+
+def test_metal_that_the_reconstruction_does_not_know_is_no_bone(folder):
+    volume, _ = read_volume(folder / "with_implant.mha")
+    write_volume(folder / "volume.mha", volume, GRID)
+    (folder / "with_implant.mha").unlink()
+    cylinder = (5, 0, -4, 5, 0, 4, 8)
+    with pytest.warns(UserWarning, match="knows of no metal"):
+        (content,) = densitometry_files(folder, folder / "d", cylinders=[cylinder], figures=False)
+    assert content.calcium_mg_ml < 121 and content.left_out > 0.02
+
+
+def test_a_folder_that_does_not_say_what_was_measured_is_doubted(folder):
+    (folder / "measured.mha").unlink()
+    with pytest.warns(UserWarning, match="does not tell which voxels were measured"):
+        densitometry_files(folder, folder / "d", cylinders=[(5, 0, -4, 5, 0, 4, 3)], figures=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import warnings
 from pathlib import Path
 
 import h5py
@@ -14,6 +16,7 @@ from PIL import Image
 from pydicom.dataset import FileDataset, FileMetaDataset
 
 from torchkcreg.io import ProjectionFile, read_geometry, read_projections
+from torchkcreg.io.scans.series import in_order
 
 RANDOM = np.random.default_rng(5)
 LINES = RANDOM.uniform(0.2, 3, (12, 6, 7))
@@ -340,3 +343,72 @@ def test_a_folder_may_mix_endings_of_one_kind(tmp_path):
         image(tmp_path / f"{index}.tif", LINES[index].astype(np.float32))
         (tmp_path / f"{index}.tif").rename(tmp_path / f"{index}{suffix}")
     np.testing.assert_allclose(lines_of(tmp_path), LINES[:3], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["p_-2.tif", "p_-1.tif", "p_0.tif", "p_1.tif", "p_10.tif"],
+        ["view-2.tif", "view-1.tif", "view0.tif", "view1.tif"],
+        ["scan-001.tif", "scan-002.tif", "scan-010.tif"],
+        ["2024-05-01_2.tif", "2024-05-01_10.tif", "2024-05-02_1.tif"],
+        ["-1.5.tif", "-0.5.tif", "0.5.tif"],
+        ["angle=-0.50.tif", "angle=-0.25.tif", "angle=0.00.tif"],
+        ["1.2.9.tif", "1.2.10.tif"],
+        ["IM.0001", "IM.0002"],
+        ["a.nii.gz", "b.nii.gz"],
+    ],
+)
+def test_views_are_in_the_order_of_the_numbers_in_their_names(names):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert [path.name for path in in_order(Path(name) for name in reversed(names))] == names
+
+
+def test_points_in_names_that_could_separate_numbers_are_said():
+    names = ["p_0.0.tif", "p_0.25.tif", "p_0.5.tif", "p_1.0.tif"]
+    with pytest.warns(UserWarning, match=r"read as decimal points: p_0.0.tif, p_0.25.tif"):
+        assert [path.name for path in in_order(Path(name) for name in reversed(names))] == names
+
+
+def beamline(path, put, flat=3000):
+    """A Data Exchange file of 3 views whose data are put there by a function of the group."""
+    with h5py.File(path, "w") as file:
+        group = file.create_group("exchange")
+        put(group)
+        group["data_white"] = np.full((2, 30, 40), flat, np.uint16)
+
+
+def test_hdf5_that_cannot_be_read_says_why_and_what_to_do(tmp_path):
+    images = np.full((3, 30, 40), 2000, np.uint16)
+
+    def stopped(group):
+        data = group.create_dataset("data", images.shape, "u2", chunks=(1, 30, 40))
+        data[0], data[2] = images[0], images[2]
+
+    beamline(tmp_path / "plain.h5", lambda group: group.create_dataset("data", data=images))
+    assert read_projections(tmp_path / "plain.h5").line_integrals.shape == (3, 30, 40)
+    link = h5py.ExternalLink("plain.h5", "/exchange/data")
+    beamline(tmp_path / "link.h5", lambda group: group.__setitem__("data", link))
+    with pytest.raises(ValueError, match=r"link\.h5.* link to another file, plain\.h5: give the file"):
+        read_projections(tmp_path / "link.h5")
+    beamline(tmp_path / "stopped.h5", stopped)
+    with pytest.raises(ValueError, match=r"stopped\.h5.* view 1 was never written"):
+        read_projections(tmp_path / "stopped.h5")
+    beamline(tmp_path / "lzf.h5", lambda group: group.create_dataset("data", data=images, compression="lzf"))
+    if importlib.util.find_spec("lzf") is None:
+        with pytest.raises(ValueError, match=r"compressed by LZF, which cannot be read here: rewrite it"):
+            read_projections(tmp_path / "lzf.h5")
+    beamline(tmp_path / "soft.h5", lambda group: group.__setitem__("data", h5py.SoftLink("/nowhere")))
+    with pytest.raises(ValueError, match="no dataset"):
+        read_projections(tmp_path / "soft.h5", views=[0])
+
+
+def test_images_that_were_divided_by_their_flat_field_are_refused(tmp_path):
+    shares = np.full((3, 30, 40), 0.66, np.float32)
+    beamline(tmp_path / "divided.h5", lambda group: group.create_dataset("data", data=shares))
+    with pytest.raises(ValueError, match="were divided already: give an open beam of 1"):
+        read_projections(tmp_path / "divided.h5")
+    with pytest.warns(UserWarning, match="says an open beam of 3000, the one that was given is 1"):
+        lines = read_projections(tmp_path / "divided.h5", open_beam=1.0).line_integrals
+    assert lines.mean() == pytest.approx(-np.log(0.66), rel=1e-5)

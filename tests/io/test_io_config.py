@@ -58,3 +58,9 @@ def test_a_bad_configuration_is_refused_in_one_line_that_names_it(tmp_path, text
     with pytest.raises(ValueError, match=rf"^configuration file .*c\.yaml.*{message}") as caught:
         read_config(tmp_path / "c.yaml")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("word", ["on", "off", "yes", "no", "On", "NO", "y"])
+def test_words_that_old_yaml_takes_for_truth_stay_words(tmp_path, word):
+    (tmp_path / "o.yaml").write_text(f"view_motion: {word}\n{word}: 1\nflag: true\n")
+    assert read_config(tmp_path / "o.yaml") == {"view_motion": word, word: 1, "flag": True}

@@ -39,6 +39,6 @@ def _densitometry(options: argparse.Namespace) -> Answer:
     lines = [f"{'region':12} {'mL':>8} {'calcium':>10} {'std':>7} {'HA':>8}  mg/mL"]
     for region in regions:
         text = f"{region.name:12} {region.volume_ml:8.3f} {region.calcium_mg_ml:10.1f} {region.std_mg_ml:7.1f}"
-        near_metal = f"  ({100 * region.left_out:.0f} % too near to metal)" if region.left_out else ""
+        near_metal = f"  ({100 * region.left_out:.0f} % left out)" if region.left_out else ""
         lines.append(f"{text} {region.hydroxyapatite_mg_ml:8.1f}{near_metal}")
     return Answer("\n".join(lines), {"regions": [vars(region) for region in regions]})

@@ -19,14 +19,11 @@ def add_register(commands) -> None:
         commands, "register", _register, "measure the pose and deformation of an implant from a few X-ray views"
     )
     mesh = "closed mesh of the undeformed implant (mm); for several implants, repeat it, --components, --init, ..."
-    command.add_argument("--implant", type=Path, action="append", required=True, help=mesh)
-    command.add_argument(
-        "--geometry", type=Path, required=True, help="projection matrices (JSON, XML, NPY, CSV, DICOM)"
-    )
+    command.add_argument("--implant", type=Path, action="append", help=mesh)
+    command.add_argument("--geometry", type=Path, help="projection matrices (JSON, XML, NPY, CSV, DICOM)")
     command.add_argument(
         "--projections",
         type=Path,
-        required=True,
         help="intensities or line integrals (NPZ, MHA, TIFF, a folder, YAML, ...)",
     )
     command.add_argument("--out", type=Path, required=True, help="run folder to write")
@@ -41,7 +38,8 @@ def add_register(commands) -> None:
     rest = "run folder of a registration without load: its shape is the rest shape of the finite elements"
     command.add_argument("--rest", type=_path_or_none, action="append", help=rest)
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, if the file does not give it")
-    command.add_argument("--config", type=Path, help="options as YAML or JSON; flags override it")
+    options = "options as YAML or JSON, or the config.yaml of a run to repeat it; flags override it"
+    command.add_argument("--config", type=Path, help=options)
     command.add_argument("--preset", help="optimization schedule: gauss-newton, paper (CMA-ES) or adam")
     command.add_argument(
         "--deformation",
@@ -86,7 +84,8 @@ def _register(options: argparse.Namespace) -> Answer:
     single = ("geometry", "projections", "spectrum", "views", "open_beam", "config")
     per_implant = {name: _only(getattr(options, name)) for name in ("implant", "components", "init", "rest")}
     materials = options.material if options.material and len(options.material) > 1 else None
-    files = RegistrationFiles(**per_implant, materials=materials, **{name: getattr(options, name) for name in single})
+    given = {**per_implant, "materials": materials, **{name: getattr(options, name) for name in single}}
+    files = RegistrationFiles.of(given)
     names = ("preset", "deformation", "pitch_mm", "seed", "backend", "device")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     overrides |= {"material": options.material[0]} if options.material else {}

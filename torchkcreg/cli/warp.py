@@ -21,10 +21,17 @@ def add_warp(commands) -> None:
     command.add_argument(
         "--implant-name", help="which implant the points belong to, if the run has several (name of its mesh file)"
     )
+    command.add_argument("--overwrite", action="store_true", help="replace the file to write if it exists")
 
 
 def _warp(options: argparse.Namespace) -> Answer:
     from torchkcreg.commands import warp_files
 
-    outside = warp_files(options.run_folder, options.points, options.out, implant_name=options.implant_name)
+    outside = warp_files(
+        options.run_folder,
+        options.points,
+        options.out,
+        implant_name=options.implant_name,
+        overwrite=options.overwrite,
+    )
     return Answer("", {"out": options.out, "points": len(outside), "outside": int(outside.sum())})

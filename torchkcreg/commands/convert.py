@@ -10,6 +10,7 @@ import torch
 from torchkcreg.geometry import gantry_about_z
 from torchkcreg.io import (
     WRITTEN_SUFFIXES,
+    image_header,
     read_geometry,
     read_mesh,
     read_projections,
@@ -37,7 +38,8 @@ def convert(
     """Convert a file to the format given by the target's suffix; return a one-line summary.
 
     If the target is a mesh, the source is read as a mesh. If the target is an image (MHA, NRRD, NIfTI), the source is
-    read as projections, and their line integrals are written, with NaN in masked pixels. Otherwise both are geometries.
+    read as projections, and their line integrals are written, with NaN in masked pixels; spacing and origin of the
+    source's header are kept. Otherwise both are geometries.
 
     Args:
         source: See `read_geometry`, `read_mesh`, `read_projections`.
@@ -66,7 +68,9 @@ def convert(
     if target.name.lower().endswith(IMAGE_SUFFIXES):
         stack = read_projections(source, open_beam=open_beam)
         lines = torch.where(stack.mask, stack.line_integrals, torch.nan)
-        write_stack(target, lines, spacing or (stack.header.spacing if stack.header else None))
+        kept = image_header(source) if source.is_file() else None
+        origin = None if kept is None else kept.origin_mm
+        write_stack(target, lines, spacing or (stack.header.spacing if stack.header else None), origin)
         masked = f"; {note}" if (note := stack.masked_note()) else ""
         return f"line integrals of {len(lines)} views of {lines.shape[1]} x {lines.shape[2]} pixels: {target}{masked}"
     if target.suffix.lower() not in GEOMETRY_SUFFIXES or source.name.lower().endswith(IMAGE_SUFFIXES):

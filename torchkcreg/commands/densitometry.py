@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,6 +17,9 @@ from torchkcreg.io import read_json, read_volume, write_figure, write_json
 from torchkcreg.physics import calcium_of
 from torchkcreg.visualization import reconstruction_figure
 
+_NO_BONE_MG_ML = 900.0  # cortical bone has 450, enamel 1100
+_ROUNDED = 0.1  # a cylinder's voxels may add up to so much less than its volume
+_NOTICEABLE = 0.005
 _METAL = 0.05  # a voxel is metal if the implant adds more than this fraction of its largest added attenuation
 
 
@@ -28,12 +34,15 @@ def densitometry_files(
 ) -> list[MineralContent]:
     """Measure calcium in regions of a reconstruction; write `densitometry.json` and `densitometry.png` to `out`.
 
+    Parts of a region beyond the volume, not seen from all sides, or near metal are left out, with a warning.
+
     Args:
         reconstruction: Folder of a reconstruction by any method; the metal is most accurate with `kcrec`.
         out: Output folder, created if missing.
         cylinders: Cylindrical regions, seven numbers each: both ends of the axis (x, y, z) and the radius, mm.
         labels: Label map on the reconstruction's voxels, such as a segmentation: each label above zero is a region.
-        from_metal_mm: Voxels closer to metal than this are ignored.
+        from_metal_mm: Voxels closer to metal than this are ignored. If the reconstruction knows of no metal, voxels
+            that are too dense for bone count as metal.
         figures: Draw the regions.
 
     Raises:
@@ -50,10 +59,17 @@ def densitometry_files(
         raise ValueError("densitometry needs regions: cylinders, or a label map")
     if from_metal_mm < 0:
         raise ValueError(f"from_metal_mm must not be negative, got {from_metal_mm}")
-    metal = _metal(reconstruction, volume)
-    usable = distance_to(metal, grid) >= max(from_metal_mm, 1e-9)
     calcium = calcium_of(volume, float(energy))
-    contents = mineral_content(calcium, regions, grid, usable=usable)
+    metal = _metal(reconstruction, volume, calcium)
+    apart = distance_to(metal, grid) >= max(from_metal_mm, 1e-9)
+    seen = _seen(reconstruction, grid)
+    usable = apart & seen
+    contents = [
+        replace(content, left_out=_left_out(name, content, cylinder, regions[name], grid, apart, seen))
+        for (name, cylinder), content in zip(
+            _named(cylinders, regions), mineral_content(calcium, regions, grid, usable=usable), strict=True
+        )
+    ]
     out.mkdir(parents=True, exist_ok=True)
     record = {
         "units": {"calcium": "mg/mL", "hydroxyapatite": "mg/mL", "content": "mg of hydroxyapatite", "volume": "mL"},
@@ -81,11 +97,60 @@ def _record(content: MineralContent) -> dict[str, float | str | int]:
     return {**vars(content), "hydroxyapatite_mg_ml": content.hydroxyapatite_mg_ml, "content_mg": content.content_mg}
 
 
-def _metal(reconstruction: Path, volume: Tensor) -> Tensor:
-    """Mask of metal voxels (D, H, W); all False if the reconstruction had no known metal."""
+def _named(
+    cylinders: Sequence[Sequence[float]], regions: Mapping[str, Tensor]
+) -> list[tuple[str, Sequence[float] | None]]:
+    """Name of each region, and its cylinder if it is one."""
+    shapes = [*cylinders, *[None] * (len(regions) - len(cylinders))]
+    return list(zip(regions, shapes, strict=True))
+
+
+def _left_out(
+    name: str,
+    content: MineralContent,
+    cylinder: Sequence[float] | None,
+    region: Tensor,
+    grid: VolumeGrid,
+    apart: Tensor,
+    seen: Tensor,
+) -> float:
+    """Share of a region that is not measured; a warning says why."""
+    inside, whole = float(region.sum()), float(region.sum())
+    if cylinder is not None:
+        ends = torch.tensor([cylinder[:3], cylinder[3:6]], dtype=torch.float64)
+        solid = math.pi * cylinder[6] ** 2 * float((ends[1] - ends[0]).norm()) / grid.voxel_volume
+        whole = solid if solid > (1 + _ROUNDED) * inside else inside
+    reasons = {
+        "lies beyond the volume": 1 - inside / whole,
+        "is not seen from all sides": float((region.bool() & ~seen).sum()) / whole,
+        "is metal or too near to it": float((region.bool() & seen & ~apart).sum()) / whole,
+    }
+    if stated := [f"{100 * share:.0f} % {reason}" for reason, share in reasons.items() if share >= _NOTICEABLE]:
+        warnings.warn(f"{name}: {', '.join(stated)} and is left out", stacklevel=3)
+    return 1 - content.num_voxels / whole
+
+
+def _seen(reconstruction: Path, grid: VolumeGrid) -> Tensor:
+    """Mask of voxels (D, H, W) that are seen from all sides; all True with a warning if the folder does not tell."""
+    path = reconstruction / "measured.mha"
+    if path.exists():
+        return read_volume(path)[0] > 0.5
+    warnings.warn(f"folder {reconstruction} does not tell which voxels were measured: reconstruct again", stacklevel=3)
+    return torch.ones(tuple(grid.shape), dtype=torch.bool)
+
+
+def _metal(reconstruction: Path, volume: Tensor, calcium: Tensor) -> Tensor:
+    """Mask of metal voxels (D, H, W): the known metal, or what no bone can be if the reconstruction knew of none."""
     path = reconstruction / "with_implant.mha"
     if not path.exists():
-        return torch.zeros_like(volume, dtype=torch.bool)
+        dense = calcium > _NO_BONE_MG_ML
+        if bool(dense.any()):
+            warnings.warn(
+                f"the reconstruction knows of no metal: voxels of more than {_NO_BONE_MG_ML:.0f} mg/mL of calcium are "
+                "taken for metal; its streaks remain. Reconstruct with --method kcrec",
+                stacklevel=3,
+            )
+        return dense
     added = read_volume(path)[0] - volume
     return added > _METAL * added.max().clamp_min(1e-9)
 

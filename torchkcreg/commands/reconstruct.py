@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchkcreg.callbacks import Callback
 from torchkcreg.geometry import TwoLevelGrid, VolumeGrid
-from torchkcreg.io import REPORT, RunFolder, read_config, read_volume, write_volume
+from torchkcreg.io import RECONSTRUCTION, REPORT, RunFolder, read_config, read_volume, write_volume
 from torchkcreg.physics import material
 from torchkcreg.progress import progress_bar
 from torchkcreg.reconstruction import (
@@ -33,6 +33,7 @@ from torchkcreg.reconstruction import (
     path_lengths_through,
     prepare,
     reconstruct,
+    seen_from_all_sides,
     unknown_share,
     with_components,
 )
@@ -43,8 +44,10 @@ from .reconstruct_options import ReconstructionFiles, ReconstructionOptions
 from .report import write_report
 
 CHECKPOINT_EVERY = 5
+MEASURED = "measured.mha"
 OUTPUTS = (
     *(f"{level}{kind}.mha" for level in ("", "near_metal_") for kind in ("volume", "volume_hu", "with_implant")),
+    MEASURED,
     "slices.png",
     "beam.png",
     REPORT,
@@ -126,7 +129,8 @@ def reconstruct_files(
 
     The folder holds `volume.mha` in 1/mm (with known components: the background without them; with a single material:
     its fraction per voxel, and no CT numbers), `volume_hu.mha`, `with_implant.mha` (with known components), the same
-    three as `near_metal_...` if voxels near the metal are divided, `metrics.json`, `config.yaml`, `slices.png`,
+    three as `near_metal_...` if voxels near the metal are divided, `measured.mha` (1 where
+    lines of all directions pass the voxel), `metrics.json`, `config.yaml`, `slices.png`,
     `report.html` and, with an estimated beam, `beam.png`. Under `torchrun` the views are distributed over the
     processes, and the first process writes.
 
@@ -264,6 +268,7 @@ def _write(
         if inputs.components:
             with_implant = _with_implant(inputs, volume, grid)
             write_volume(run.path / f"{prefix}with_implant.mha", with_implant, grid)
+    write_volume(run.path / MEASURED, seen_from_all_sides(inputs.geometry, inputs.grid).to(torch.uint8), inputs.grid)
     if figures:
         if (estimate := inputs.estimate) is not None:
             curve = beam_figure(estimate.beam.beam, estimate.alloys, estimate.lengths_mm, estimate.measured)
@@ -307,7 +312,7 @@ def _record(files: ReconstructionFiles, options: ReconstructionOptions) -> dict[
 
 
 def _folder(out: Path, record: dict[str, Any], *, overwrite: bool, resume: bool) -> RunFolder:
-    run = RunFolder.create(out, overwrite=overwrite, resume=resume)
+    run = RunFolder.create(out, kind=RECONSTRUCTION, overwrite=overwrite, resume=resume)
     if resume:
         previous = read_config(run.path / "config.yaml")
         changed = sorted(key for key in previous.keys() | record.keys() if previous.get(key) != record.get(key))

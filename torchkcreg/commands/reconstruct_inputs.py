@@ -241,7 +241,10 @@ def _completed(files: ReconstructionFiles) -> ReconstructionFiles:
     record = read_config(files.run / "config.yaml").get("files") or {}
     names = ("geometry", "projections", "spectrum")
     paths = {name: getattr(files, name) or (Path(record[name]) if record.get(name) else None) for name in names}
-    open_beam = files.open_beam if files.open_beam is not None else record.get("open_beam")
+    open_beam = files.open_beam
+    named = record.get("projections")
+    if open_beam is None and (files.projections is None or (named and files.projections.resolve() == Path(named))):
+        open_beam = record.get("open_beam")
     return ReconstructionFiles(
         run=files.run, components=files.components, open_beam=open_beam, initial=files.initial, **paths
     )

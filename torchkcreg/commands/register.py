@@ -27,11 +27,10 @@ from torchkcreg.registration import (
 )
 from torchkcreg.visualization import draw_registration, draw_start, registered_layers
 
-from .register_inputs import RegistrationFiles, RegistrationInputs, read_inputs
+from .register_inputs import RECORD_KEYS, RegistrationFiles, RegistrationInputs, read_inputs
 from .report import write_report
 
 _CHECKPOINT_SECONDS = 5.0
-RECORD_KEYS = {"files", "options", "schedule"}
 
 
 def resolve_config(path: Path | None, overrides: dict[str, Any]) -> RegistrationConfig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from torchkcreg.implant import Component, ImplantPointCloud, find_holes
 from torchkcreg.io import (
     implausible_magnification,
     read_components,
+    read_config,
     read_geometry,
     read_init,
     read_mesh,
@@ -32,6 +33,7 @@ from torchkcreg.plain import first_line
 from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConfig
 from torchkcreg.scene import RegistrationData
 
+RECORD_KEYS = {"files", "options", "schedule"}  # of a run's config.yaml
 _FEWEST_NODES_ALONG = 4
 _SAME_FRAME_MM = 5.0  # tolerance between bounds of nodes and mesh: nodes do not reach the surface
 _FEWEST_PIXELS = 4  # along the detector's shorter side, after binning
@@ -135,6 +137,21 @@ class RegistrationFiles:
     open_beam: float | None = None
     config: Path | None = None
 
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> RegistrationFiles:
+        """The given files; what is None is taken from the `config.yaml` of a run, if that is the options' file.
+
+        Raises:
+            ValueError: If implant, geometry or projections are named neither way.
+        """
+        options = read_config(given["config"]) if given.get("config") else {}
+        recorded = options.get("files") if options.keys() == RECORD_KEYS else None
+        files = {key: _path(key, value) for key, value in (recorded or {}).items() if key in cls.__dataclass_fields__}
+        files |= {key: value for key, value in given.items() if value is not None}
+        if missing := [f"--{name}" for name in ("implant", "geometry", "projections") if files.get(name) is None]:
+            raise ValueError(f"a registration needs {', '.join(missing)} (or --config with the config.yaml of a run)")
+        return cls(**files)
+
     def each(self) -> list[ImplantFiles]:
         """Files of each implant.
 
@@ -158,6 +175,15 @@ class RegistrationFiles:
                 strict=True,
             )
         ]
+
+
+def _path(key: str, value: Any) -> Any:
+    """A recorded value with its texts as paths, unless it names no file."""
+    if key in ("views", "open_beam", "materials"):
+        return value
+    if isinstance(value, list):
+        return [_path(key, item) for item in value]
+    return Path(value) if isinstance(value, str) else value
 
 
 def _for_each(paths: Any, number: int, kind: str) -> list[Any]:

@@ -57,7 +57,7 @@ def write_report(folder: Path, *, out: Path | None = None) -> Path:
     3D, the folder's figures, options and versions.
 
     Args:
-        folder: Folder of a registration, a comparison, a reconstruction, or another one with `metrics.json` or figures.
+        folder: Folder of a registration, a comparison, a reconstruction, or another one with `metrics.json` or a table.
         out: Page to write; `report.html` in the folder if None.
 
     Raises:
@@ -70,9 +70,9 @@ def write_report(folder: Path, *, out: Path | None = None) -> Path:
     metrics = _read(folder / "metrics.json")
     pictures = [(NAMES.get(path.name, path.stem), path.read_bytes()) for path in _pictures(folder)]
     tables = {path.name: read_json(path, "table") for path in sorted(folder.glob("*.json")) if path.name in TABLES}
-    if not metrics and not pictures and not tables:
-        raise ValueError(f"folder {folder} holds no results: neither metrics.json nor pictures")
     is_run = (folder / "deformation.json").is_file()
+    if not metrics and not tables and not is_run:
+        raise ValueError(f"folder {folder} holds no results: neither metrics.json nor {', '.join(TABLES)}")
     rows = (_run_rows(metrics) if is_run else _scalar_rows(metrics)) + [
         row for content in tables.values() for row in _nested_rows(content)
     ]

@@ -10,7 +10,14 @@ from torch import Tensor
 from torchkcreg.io import read_points, read_run, write_points
 
 
-def warp_files(run_folder: Path, points_file: Path, out: Path, *, implant_name: str | None = None) -> Tensor:
+def warp_files(
+    run_folder: Path,
+    points_file: Path,
+    out: Path,
+    *,
+    implant_name: str | None = None,
+    overwrite: bool = False,
+) -> Tensor:
     """Write the points in the world, mm, with expected errors; return a mask (N,) of points beyond the implant's reach.
 
     Args:
@@ -18,10 +25,16 @@ def warp_files(run_folder: Path, points_file: Path, out: Path, *, implant_name: 
         points_file: Table of x, y, z in the undeformed implant's frame, mm.
         out: Table to write: x, y, z in the world, `outside`, and `lateral_std_mm`, `depth_std_mm` if the run has them.
         implant_name: Name of the implant to which the points belong, if the run has several.
+        overwrite: Replace the table if it exists; the points themselves are never replaced.
 
     Raises:
+        FileExistsError: If the table exists, or is the file of the points.
         ValueError: If the run has no implant of that name, or a file cannot be read.
     """
+    if out.exists() and out.samefile(points_file):
+        raise FileExistsError(f"{out} holds the points themselves: name another file to write")
+    if out.exists() and not overwrite:
+        raise FileExistsError(f"{out} is there already: name another file, or overwrite it")
     result, points = read_run(run_folder), read_points(points_file)
     try:
         implant = result.implant(implant_name)

@@ -18,10 +18,22 @@ from .point_clouds import (
     write_surface_vtu,
 )
 from .rtk_geometry import read_rtk, write_rtk
-from .runs import LAYERS, REPORT, RunFolder, implant_of_run, mesh_of_run, read_layers, read_run, versions, write_layers
+from .runs import (
+    LAYERS,
+    RECONSTRUCTION,
+    REPORT,
+    RunFolder,
+    implant_of_run,
+    mesh_of_run,
+    read_layers,
+    read_run,
+    versions,
+    write_layers,
+)
 from .scans import (
     ProjectionFile,
     Projections,
+    image_header,
     implausible_magnification,
     read_projections,
     write_projections,
@@ -34,6 +46,7 @@ from .volumes import read_volume, write_volume
 __all__ = [
     "LAYERS",
     "MESH_SUFFIXES",
+    "RECONSTRUCTION",
     "REPORT",
     "WRITTEN_SUFFIXES",
     "ProjectionFile",
@@ -42,6 +55,7 @@ __all__ = [
     "displacement_field",
     "geometry_from_dict",
     "geometry_to_dict",
+    "image_header",
     "implant_of_run",
     "implausible_magnification",
     "itk_transform",

@@ -36,7 +36,14 @@ CHECKPOINT, ARRAYS, UNCERTAINTY = "checkpoint.pt", "arrays.npz", "uncertainty.js
 SEEDS, LAYERS, REPORT, VTK_CLOUD = "seeds", "overlay.npz", "report.html", "implant_deformed.vtp"
 FIGURES = ("overlay.png", "displacement.png", "history.png")
 _RESULT_FILES = (DEFORMATION, METRICS, UNCERTAINTY, FIELD, TRANSFORM, CLOUD, VTK_CLOUD, ARRAYS)
-RUN_FILES = (CONFIG, VERSIONS, HISTORY, CHECKPOINT, *_RESULT_FILES, *FIGURES, LAYERS, REPORT)
+REGISTRATION, RECONSTRUCTION = "registration", "reconstruction"
+_CORRECTED = "geometry_corrected.json"
+_DERIVED = {  # folders that other commands write into a run by default, which belong to its result
+    "load": ("load.json", "load.png", "load.vtu", REPORT),
+    "compare": ("compare.json", "compare.csv", "compare.png", REPORT),
+    "densitometry": ("densitometry.json", "densitometry.png", REPORT),
+}
+RUN_FILES = (CONFIG, VERSIONS, HISTORY, CHECKPOINT, *_RESULT_FILES, *FIGURES, LAYERS, REPORT, _CORRECTED)
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
@@ -137,16 +144,25 @@ class RunFolder:
         self.path = Path(path)
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], *, overwrite: bool = False, resume: bool = False) -> RunFolder:
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        kind: str = REGISTRATION,
+        overwrite: bool = False,
+        resume: bool = False,
+    ) -> RunFolder:
         """Create or open a run folder for writing.
 
         Args:
             path: The folder. It is created with its parents if missing. An existing empty folder is used.
+            kind: "registration" or "reconstruction". A folder of the other kind is never taken.
             overwrite: Discard an existing run: the files written by a run are deleted, other files stay.
             resume: Continue an existing run.
 
         Raises:
-            FileExistsError: The folder holds a run and neither `overwrite` nor `resume` is set, or other files.
+            FileExistsError: The folder holds a run and neither `overwrite` nor `resume` is set, or one of the other
+                kind, or other files.
             FileNotFoundError: There is no run to resume.
             NotADirectoryError: The path or one of its parents is a file.
             ValueError: Both `overwrite` and `resume` are set.
@@ -163,6 +179,8 @@ class RunFolder:
             raise NotADirectoryError(f"run folder {run.path} cannot be made: a file is in the way") from error
         if not is_run and any(not entry.name.startswith(TEMPORARY_PREFIX) for entry in run.path.iterdir()):
             raise FileExistsError(f"folder {run.path} is not empty and holds no run: choose another one")
+        if is_run and (held := _kind(run.path)) != kind:
+            raise FileExistsError(f"folder {run.path} holds a {held}, no {kind}: choose another one")
         if is_run and not (resume or overwrite):
             raise FileExistsError(f"run folder {run.path} holds a run already: overwrite or resume it")
         run._discard(() if resume else RUN_FILES)
@@ -280,6 +298,11 @@ class RunFolder:
                 path.unlink()
         if names:
             self._discard_seeds(names)
+            for folder, files in _DERIVED.items():
+                for name in files:
+                    (self.path / folder / name).unlink(missing_ok=True)
+                if (self.path / folder).is_dir() and not any((self.path / folder).iterdir()):
+                    (self.path / folder).rmdir()
 
     def _discard_seeds(self, names: tuple[str, ...]) -> None:
         folder = self.path / SEEDS
@@ -288,6 +311,14 @@ class RunFolder:
         for emptied in (*folder.glob("*/"), folder):
             if emptied.is_dir() and not any(emptied.iterdir()):
                 emptied.rmdir()
+
+
+def _kind(folder: Path) -> str:
+    """Kind of result in a folder with a `config.yaml`."""
+    try:
+        return RECONSTRUCTION if RECONSTRUCTION in read_config(folder / CONFIG) else REGISTRATION
+    except ValueError:  # damaged: a registration's result tells
+        return REGISTRATION
 
 
 def uncertainty_of(result: RegistrationResult) -> dict[str, Any]:

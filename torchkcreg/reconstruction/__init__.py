@@ -12,7 +12,7 @@ from .beam_estimate import BeamEstimate, estimate_beam
 from .corrections import fit_veil, floored_line_integrals, refined_scatter
 from .decomposition import Decomposition, decompose
 from .fdk import FDKConfig, fdk
-from .field_of_view import coverage, field_of_view_grid
+from .field_of_view import coverage, field_of_view_grid, seen_from_all_sides
 from .inpainting import filled, inpainted
 from .kcrec import (
     component_path_lengths,
@@ -71,6 +71,7 @@ __all__ = [
     "quadratic_roughness",
     "reconstruct",
     "refined_scatter",
+    "seen_from_all_sides",
     "statistical_weights",
     "unknown_share",
     "veil_image",

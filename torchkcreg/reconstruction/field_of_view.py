@@ -12,6 +12,7 @@ from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
 
 COARSE_MM = 8.0  # coverage is smooth: it is computed on nodes about this far apart
 RIM_PX = 8.0  # width of the border over which coverage falls to zero
+MOST_SECTORS, COMPLETE = 36, 0.96  # sectors of directions, and the share of them that must hold a line
 SPREAD_MM = 10.0  # focal spots whose mean heights differ by less are treated as one
 
 
@@ -30,6 +31,33 @@ def coverage(geometry: ConeBeamGeometry, grid: VolumeGrid) -> Tensor:
     inside = ((inward / rim).clamp(0, 1).amin(-1) * (depth > 0)).mean(0)
     coarse = inside.reshape(1, 1, *shape).float()
     return interpolate(coarse, size=tuple(grid.shape), mode="trilinear", align_corners=True)[0, 0]
+
+
+def seen_from_all_sides(geometry: ConeBeamGeometry, grid: VolumeGrid) -> Tensor:
+    """True for voxels (D, H, W) that lines of all directions around the z axis pass, half a turn of them.
+
+    A voxel beyond the fan of a full turn is not, nor one that a short scan sees from too few sides; one that a half-fan
+    turn sees in half of its views is.
+    """
+    steps = [max(1, round(COARSE_MM / 2 / d)) for d in reversed(grid.spacing)]
+    picks = [torch.linspace(0, n - 1, -(-n // step) + 1).round().long().unique() for n, step in zip(grid.shape, steps)]
+    k, j, i = torch.meshgrid(*picks, indexing="ij")
+    matrix = grid.voxel_to_world
+    points = torch.stack([i, j, k], dim=-1).reshape(-1, 3).double() @ matrix[:3, :3].mT + matrix[:3, 3]
+    sectors = max(4, min(MOST_SECTORS, geometry.num_views // 4))
+    hit = torch.zeros(len(points), sectors, dtype=torch.bool)
+    rows, cols = geometry.det_shape
+    limits = torch.tensor([cols - 0.5, rows - 0.5], dtype=torch.float64)
+    for view in range(geometry.num_views):
+        one = geometry.select([view])
+        uv, depth = (x[0].cpu() for x in one.project(points.to(geometry.projection_matrices.device)))
+        inside = ((uv >= -0.5) & (uv <= limits)).all(-1) & (depth > 0)
+        along = points[:, :2] - one.source_positions[0, :2].cpu()
+        sector = ((torch.atan2(along[:, 1], along[:, 0]) % math.pi) / math.pi * sectors).long().clamp(max=sectors - 1)
+        hit[inside, sector[inside]] = True
+    complete = hit.double().mean(1).reshape(1, 1, *k.shape)
+    whole = interpolate(complete, size=tuple(grid.shape), mode="trilinear", align_corners=True)[0, 0]
+    return whole >= COMPLETE
 
 
 def field_of_view_grid(geometry: ConeBeamGeometry, spacing: float) -> VolumeGrid:

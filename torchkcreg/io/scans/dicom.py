@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, DetectorFrames
 
-from .series import by_number
+from .series import in_order
 
 DICOM_SUFFIXES = (".dcm", ".ima")
 NEEDED = "DICOM files need pydicom: pip install 'torchkcreg[io]'"
@@ -40,7 +40,7 @@ def dicom_files(folder: Path) -> list[Path]:
 
 def _ordered(folder: Path) -> dict[Path, Any]:
     """DICOM files of a folder in order, with their tags."""
-    tags = {file: _tags(file) for file in sorted(filter(is_dicom, folder.iterdir()), key=by_number)}
+    tags = {file: _tags(file) for file in in_order(filter(is_dicom, folder.iterdir()))}
     numbers = {file: _number(dataset, "InstanceNumber", 0) for file, dataset in tags.items()}
     if 1 < len(set(numbers.values())) < len(numbers):
         raise ValueError("its DICOM files do not say their order: InstanceNumber is missing or the same in some")

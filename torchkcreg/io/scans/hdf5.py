@@ -5,7 +5,9 @@ Files are read with pyfive, because the HDF5 library crashes on some damaged fil
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,20 @@ from .images import can_hold
 from .series import ImageSeries
 
 HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs")
+_FILTERS = {
+    4: "SZIP",
+    32000: "LZF",
+    32001: "Blosc",
+    32004: "LZ4",
+    32008: "bitshuffle",
+    32013: "ZFP",
+    32015: "Zstandard",
+    32026: "Blosc2",
+}
+_READ_BY_ALL = 3  # deflate, shuffle, checksum
+_DEEPEST = 8  # groups inside groups; links can go round in circles
+_OTHER_FILE = re.compile(rb"[\w./ -]+\.(?:h5|hdf5|hdf|nxs)")
+_LINKS_WITHIN = 1 << 20
 _PROJECTION, _FLAT, _DARK = 0, 1, 2  # values of NXtomo's image_key
 
 
@@ -35,9 +51,8 @@ def open_hdf5(path: Path, dataset: str | None = None) -> ImageSeries:
         import pyfive
     except ImportError:
         raise ImportError("HDF5 files need pyfive: pip install 'torchkcreg[io]'") from None
-    with _opened(pyfive, path) as file:
-        stacks: dict[str, Any] = {}
-        file.visititems(lambda name, item: stacks.update({name: item}) if getattr(item, "ndim", 0) == 3 else None)
+    with _opened(pyfive, path) as file, _explained(path):
+        stacks = dict(_stacks(file))
         name = _chosen(stacks, dataset)
         data = stacks[name]
         _check(data, name, path)
@@ -57,7 +72,7 @@ def open_hdf5(path: Path, dataset: str | None = None) -> ImageSeries:
                     fields[kind] = _plain(data).mean(np.flatnonzero(keys == number).tolist())
 
     def read(indices: Sequence[int]) -> NDArray:
-        with _opened(pyfive, path) as reopened:
+        with _opened(pyfive, path) as reopened, _explained(path, reopened[name]):
             images = np.stack([np.asarray(reopened[name][views[index]]) for index in indices])
         if images.ndim != 3 or images.dtype.kind not in "uif":
             raise ValueError(f"dataset {name} gives no images: is it a virtual dataset? Write it as a plain one")
@@ -73,11 +88,60 @@ def _opened(pyfive: Any, path: Path) -> Any:
         raise ValueError(f"is no HDF5 file that can be read: {first_line(error, otherwise='damaged')}") from error
 
 
+def _stacks(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Names and datasets of three dimensions in a group and all groups in it; broken links are passed over."""
+    for key in group:
+        try:
+            item = group[key]
+        except KeyError:
+            continue
+        if getattr(item, "ndim", 0) == 3:
+            yield f"{prefix}{key}", item
+        elif hasattr(item, "keys") and prefix.count("/") < _DEEPEST:
+            yield from _stacks(item, f"{prefix}{key}/")
+
+
+@contextmanager
+def _explained(path: Path, data: Any = None) -> Iterator[None]:
+    """Turn errors of the reader's library into what a user can do about them."""
+    try:
+        yield
+    except (ValueError, OSError):
+        raise
+    except AssertionError as error:  # how the library ends at a link that leaves the file
+        others = sorted(set(_OTHER_FILE.findall(path.read_bytes()[:_LINKS_WITHIN])) - {path.name.encode()})
+        named = f", {others[0].decode()}" if len(others) == 1 else ""
+        raise ValueError(f"holds a link to another file{named}: give the file that holds the data") from error
+    except (ImportError, NotImplementedError) as error:
+        how = f"by {_filters(data)}" if data is not None else "in a way"
+        raise ValueError(
+            f"is compressed {how}, which cannot be read here: rewrite it, by h5repack -f GZIP=4 {path.name} new.h5"
+        ) from error
+    except KeyError as error:
+        missing = error.args[0] if error.args else None
+        if not isinstance(missing, tuple):
+            raise ValueError(f"cannot be read: it has no {first_line(error)}") from error
+        raise ValueError(
+            f"view {missing[0]} was never written: was the scan stopped? Write a dataset of the views that are there"
+        ) from error
+    except Exception as error:  # zlib, struct and others on damaged data
+        raise ValueError(f"cannot be read: {first_line(error, otherwise='damaged')}") from error
+
+
+def _filters(data: Any) -> str:
+    """Names of the compression filters of a dataset."""
+    pipeline = getattr(data.id, "filter_pipeline", None) or []
+    numbers = [int(step.get("filter_id", -1)) for step in pipeline]
+    names = [_FILTERS.get(number, f"filter {number}") for number in numbers if number > _READ_BY_ALL]
+    return " and ".join(names) or "a filter"
+
+
 def _chosen(stacks: dict[str, Any], dataset: str | None) -> str:
     if dataset is not None:
         if dataset.strip("/") not in stacks:
             raise ValueError(f"has no dataset {dataset} of three dimensions; it has {', '.join(stacks) or 'none'}")
         return dataset.strip("/")
+    stacks = {name: data for name, data in stacks.items() if not name.endswith(("data_white", "data_dark"))}
     known = [name for name, data in stacks.items() if name.endswith("exchange/data") or "image_key" in data.parent]
     measured = [name for name in known if "detector/" in name]  # the others are links to it
     for names in (known, measured, list(stacks)):

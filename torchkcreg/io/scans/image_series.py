@@ -21,7 +21,7 @@ from .dicom import DICOM_SUFFIXES, dicom_files, dicom_images, is_dicom
 from .hdf5 import HDF5_SUFFIXES, open_hdf5
 from .images import PAGE_SUFFIXES, num_pages, opened, read_pages, read_slices
 from .plausible import ImageHeader
-from .series import ImageSeries, by_number
+from .series import ImageSeries, in_order
 
 DESCRIPTION_SUFFIXES = (".yaml", ".yml")
 STACK_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".nii.gz")
@@ -170,7 +170,7 @@ def _of_folder(folder: Path) -> ImageSeries:
     if formats == ["DICOM"]:
         views = dicom_files(folder)
     else:
-        views = sorted(kinds, key=by_number)
+        views = in_order(kinds)
         _check_numbers(views)
     first, header = _single(views[0])
 
@@ -246,9 +246,7 @@ def _described(path: Path) -> ImageSeries:
 
 def _opened(scan: ScanDescription, place: Path) -> ImageSeries:
     if scan.raw is not None:
-        files = sorted(
-            (file for file in (place.iterdir() if place.is_dir() else [place]) if _is_raw(file)), key=by_number
-        )
+        files = in_order(file for file in (place.iterdir() if place.is_dir() else [place]) if _is_raw(file))
         if files:
             return _of_raw(scan.raw, place, files, views=place == scan.images)
     if place.suffix.lower() in HDF5_SUFFIXES:

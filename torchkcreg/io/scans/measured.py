@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,6 +17,8 @@ from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
 from .plausible import ImageHeader, stuck_pixels
 
 RELATIVE_FLOOR = 1e-6
+DIVIDED, COUNTED = 2.0, 50.0  # largest transmission; smallest open beam of a detector that counts
+OTHER_BEAM = 0.02  # relative difference of open beams that is worth a warning
 MOSTLY = 0.5  # minimum fraction of pixels with an open beam above the dark field
 DETECTOR_CEILINGS = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 16))
 
@@ -98,6 +101,9 @@ def converted(
         return _from_line_integrals(image, mask)
     if beam is None:
         raise ValueError("has intensity but no open_beam, the intensity without an object: give it")
+    _check_undivided(image, beam)
+    if open_beam is not None and "open_beam" in arrays:
+        _compare_beams(beam, arrays["open_beam"])
     dark = _dark(arrays["dark"], image.shape[1:]) if "dark" in arrays else np.zeros((1, 1, 1))
     if saturation is None and "saturation" in arrays:
         level = arrays["saturation"]
@@ -105,6 +111,28 @@ def converted(
             raise ValueError(f"saturation must be one number, got {level.dtype} {level.shape}")
         saturation = float(level.reshape(()))
     return _from_intensity(image, mask, beam, dark, saturation)
+
+
+def _check_undivided(image: NDArray, beam: NDArray) -> None:
+    """Raise ValueError if intensities were divided by the open beam already."""
+    if image.dtype.kind != "f":
+        return
+    values = image[np.isfinite(image)]
+    if values.size and 0 < values.max() <= DIVIDED and np.median(beam) >= COUNTED:
+        raise ValueError(
+            f"intensities of at most {values.max():.3g} beside an open beam of {np.median(beam):.4g} were divided "
+            "already: give an open beam of 1 (--open-beam 1)"
+        )
+
+
+def _compare_beams(given: NDArray, stored: NDArray) -> None:
+    """Warn if the given open beam differs from the file's own."""
+    levels = [float(np.median(beam)) for beam in (given, stored) if beam.dtype.kind in "uif" and beam.size]
+    if len(levels) == 2 and abs(levels[0] - levels[1]) > OTHER_BEAM * abs(levels[1]):
+        warnings.warn(
+            f"the file says an open beam of {levels[1]:.4g}, the one that was given is {levels[0]:.4g}: it is used",
+            stacklevel=4,
+        )
 
 
 def _from_line_integrals(image: NDArray, mask: NDArray) -> Projections:

@@ -130,20 +130,27 @@ def read_projections(
 
 
 def write_stack(
-    path: str | os.PathLike[str], line_integrals: Tensor, pixel_spacing: Sequence[float] | None = None
+    path: str | os.PathLike[str],
+    line_integrals: Tensor,
+    pixel_spacing: Sequence[float] | None = None,
+    origin_mm: Sequence[float] | None = None,
 ) -> None:
     """Write line integrals (V, rows, cols) as an image stack (MHA, NRRD, NIfTI) in single precision.
 
     Args:
         path: The file.
         line_integrals: Line integrals, NaN where a pixel is masked.
-        pixel_spacing: (dv, du) in mm for the header. The origin is then that of a centred detector, as in RTK.
+        pixel_spacing: (dv, du) in mm for the header.
+        origin_mm: Position (u, v) of pixel (0, 0) for the header. If only the spacing is given, it is that of a centred
+            detector, as in RTK.
     """
     image = sitk.GetImageFromArray(line_integrals.detach().cpu().float().numpy())
     if pixel_spacing is not None:
         (dv, du), (rows, cols) = pixel_spacing, line_integrals.shape[-2:]
         image.SetSpacing((float(du), float(dv), 1.0))
         image.SetOrigin((-du * (cols - 1) / 2, -dv * (rows - 1) / 2, 0.0))
+    if origin_mm is not None:
+        image.SetOrigin((float(origin_mm[0]), float(origin_mm[1]), 0.0))
     with atomic_path(path) as temporary:
         sitk.WriteImage(image, str(temporary), True)
 

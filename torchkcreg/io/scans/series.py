@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,13 +15,67 @@ from numpy.typing import NDArray
 from .plausible import ImageHeader
 
 
-def by_number(file: Path) -> list[tuple[int, str]]:
-    """Sort key for file names with numbers: view_2 comes before view_10.
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """Files in the order of the numbers in their names: view_2 before view_10, p_-1 before p_0, p_0.25 before p_0.5.
 
-    >>> [path.name for path in sorted([Path("v10.tif"), Path("v2.tif")], key=by_number)]
-    ['v2.tif', 'v10.tif']
+    A dash is a minus if it follows a blank, a bracket, `_`, `=` or nothing, or if other names have no dash in its
+    place. A point between digits is a decimal point, unless a name has several in a row. If numbers around a point
+    could also be counted each for itself and the order would then differ, there is a warning.
+
+    >>> [path.name for path in in_order([Path("v10.tif"), Path("v2.tif"), Path("v-1.tif")])]
+    ['v-1.tif', 'v2.tif', 'v10.tif']
     """
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", file.name.lower())]
+    listed = list(files)
+    stems = {file: _stem(file) for file in listed}
+    bare = {_DIGITS.sub("#", stem) for stem in stems.values()}
+
+    def key(file: Path, *, decimal: bool) -> list[tuple[float, str]]:
+        pattern = _DECIMAL if decimal else _SIGNED
+        return [_part(text, stems[file], start, bare) for text, start in _parts(pattern, stems[file])]
+
+    order = sorted(listed, key=lambda file: key(file, decimal=True))
+    has_minus = any(-math.inf < value < 0 for file in listed for value, _ in key(file, decimal=True))
+    if not has_minus and order != sorted(listed, key=lambda file: key(file, decimal=False)):
+        shown = ", ".join(file.name for file in order[:4])
+        warnings.warn(f"points in the names of the views are read as decimal points: {shown}, ...", stacklevel=2)
+    return order
+
+
+_DIGITS = re.compile(r"\d+")
+_SIGNED = re.compile(r"-?\d+")
+_DECIMAL = re.compile(r"-?(?:\d+(?:\.\d+){2,}|\d+\.\d+|\d+)")  # 1.2.3 is no number, but three
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
+_BEFORE_A_SIGN = " _=([{,;"
+
+
+def _stem(file: Path) -> str:
+    name = file.name.lower()
+    return re.sub(r"(\.[a-z]\w*)+$", "", name)  # without suffixes such as .nii.gz
+
+
+def _parts(pattern: re.Pattern[str], stem: str) -> Iterator[tuple[str, int]]:
+    """Texts and numbers of a name, and where they start."""
+    end = 0
+    for match in pattern.finditer(stem):
+        pieces = [match] if _NUMBER.fullmatch(match[0]) else list(_DIGITS.finditer(stem, *match.span()))
+        for piece in pieces:
+            if piece.start() > end:
+                yield stem[end : piece.start()], end
+            yield piece[0], piece.start()
+            end = piece.end()
+    if end < len(stem):
+        yield stem[end:], end
+
+
+def _part(text: str, stem: str, start: int, bare: set[str]) -> tuple[float, str]:
+    if not _NUMBER.fullmatch(text):
+        return (-math.inf, text)
+    if not text.startswith("-"):
+        return (float(text), "")
+    before = stem[start - 1] if start else ""
+    without = _DIGITS.sub("#", stem[:start] + stem[start + 1 :])
+    is_minus = before in _BEFORE_A_SIGN or (without in bare and not before.isdigit())
+    return (float(text) if is_minus else float(text[1:]), "")
 
 
 @dataclass(frozen=True)
