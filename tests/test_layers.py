@@ -101,6 +101,7 @@ def test_a_file_has_one_subject_and_stays_short(path):
 
 
 REASONS = {
+    "mechanics/bodies.py": "which parts of an implant touch, before there is an elastic body",
     "deformation/ffd.py": "the paper's model, which users look for under this name",
     "deformation/reading.py": "reads every model, so it imports them all",
     "evaluation/regions.py": "public functions of their own subject",

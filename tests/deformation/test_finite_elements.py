@@ -43,7 +43,7 @@ def test_the_truth_lies_about_as_far_off_as_the_loads_say(found) -> None:
     off = carried.hold_loads - loads @ torch.block_diag(carried.axes, carried.axes).mT
     assert float((off.abs() / carried.hold_std).max()) < 4
     nothing_seen = CarriedLoad.of(result.deformation.superelement, result.deformation.amounts.detach())
-    assert float((carried.section_std / nothing_seen.section_std)[60, [3, 5]].max()) < 0.9  # less than without images
+    assert float((carried.section_std / nothing_seen.section_std)[60, [3, 5]].max()) < 0.98  # less than without images
 
 
 def test_a_run_folder_keeps_the_body_beside_its_json(found, tmp_path) -> None:

@@ -10,7 +10,8 @@ import torch
 import trimesh
 
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics import ElasticBody, Hexahedra, edge_for, stiffness_matrix, von_mises
+from torchkcreg.mechanics import ElasticBody, Hexahedra, edge_for, num_shells, stiffness_matrix, von_mises
+from torchkcreg.mechanics.bodies import body_volumes
 from torchkcreg.physics import elastic_constants
 
 STEEL = elastic_constants("steel")
@@ -22,11 +23,11 @@ HELD = 8.0  # of each end
 class Bar:
     """A bar of 10 x 4 x 120 mm, turned somehow, and loads on its ends in its own axes."""
 
-    def __init__(self, degrees: float) -> None:
+    def __init__(self, degrees: float, pitch: float = 0.25) -> None:
         turn = trimesh.transformations.rotation_matrix(math.radians(degrees), [1.0, 0.5, 0.2])
         mesh = trimesh.creation.box((WIDE, THICK, LONG)).apply_transform(turn)
         self.turn = torch.from_numpy(turn[:3, :3].copy())
-        self.cloud = ImplantPointCloud.from_mesh(mesh, 0.25)
+        self.cloud = ImplantPointCloud.from_mesh(mesh, pitch)
         self.body = ElasticBody(self.cloud, STEEL)
         self.points = self.cloud.points.double()
         self.local = self.points @ self.turn
@@ -158,3 +159,43 @@ def test_constants_are_known_of_alloys_alone() -> None:
     with pytest.raises(ValueError, match=r"elastic constants are available for .*steel.*, not for water"):
         elastic_constants("water")
     assert elastic_constants("316L") == STEEL
+
+
+@pytest.mark.parametrize(
+    ("wide", "thick", "pitch", "degrees"),
+    [
+        (13.5, 4.6, 0.25, 0.0),
+        (13.5, 4.6, 0.25, 7.5),
+        (11.0, 3.3, 0.25, 0.0),
+        (11.0, 3.3, 0.5, 0.0),
+        (6.0, 1.5, 0.25, 0.0),
+    ],
+)
+def test_plates_that_the_cubes_do_not_tile_bend_as_beam_theory_says(monkeypatch, wide, thick, pitch, degrees) -> None:
+    for name, value in (("WIDE", wide), ("THICK", thick)):
+        monkeypatch.setitem(globals(), name, value)
+    bar = Bar(degrees, pitch)
+    assert bar.rate(bar.bent("moment", 0), 1, 2) * E * wide * thick**3 / 12 == pytest.approx(1.0, abs=0.001)
+    assert bar.rate(bar.bent("moment", 1), 0, 2) * E * thick * wide**3 / 12 == pytest.approx(1.0, abs=0.001)
+    assert bar.rate(bar.bent("force", 2), 2, 3) * E * wide * thick == pytest.approx(1.0, abs=0.001)
+    middle = bar.points[bar.local[:, 2].abs() < 20]
+    nodal = bar.body.response(*([part] for part in bar.load("force", 2)))
+    tension = (bar.turn.T @ bar.body.stress(middle, nodal)[0] @ bar.turn)[:, 2, 2].abs() * wide * thick
+    assert tension.tolist() == pytest.approx([1.0] * len(tension), abs=0.005)
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.3, 6.0])
+def test_bodies_that_do_not_touch_are_not_glued_together(gap) -> None:
+    plate = trimesh.creation.box((12, 2, 60))
+    pair = trimesh.util.concatenate([plate, plate.copy().apply_translation([0, 2 + gap, 0])])
+    assert num_shells(pair) == 2 and num_shells(plate) == 1
+    with pytest.raises(ValueError, match="2 bodies that do not touch: register each"):
+        ElasticBody(ImplantPointCloud.from_mesh(pair, 0.25, dtype=torch.float64), STEEL)
+
+
+def test_a_hollow_implant_is_one_body() -> None:
+    outer, inner = trimesh.creation.box((12, 6, 40)), trimesh.creation.box((6, 2, 20))
+    inner.invert()
+    hollow = trimesh.util.concatenate([outer, inner])
+    assert num_shells(hollow) == 1
+    assert len(body_volumes(ImplantPointCloud.from_mesh(hollow, 0.5))) == 1

@@ -28,9 +28,11 @@ from torchkcreg.io import (
     read_spectrum,
 )
 from torchkcreg.kernels import choose_backend
+from torchkcreg.mechanics import num_shells, separate_bodies
 from torchkcreg.physics import Spectrum, material
 from torchkcreg.plain import first_line
 from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConfig
+from torchkcreg.registration.implant import bends_elastically
 from torchkcreg.scene import RegistrationData
 
 RECORD_KEYS = {"files", "options", "schedule"}  # of a run's config.yaml
@@ -65,6 +67,8 @@ def read_implant(files: ImplantFiles, config: RegistrationConfig) -> Implant:
     if files.init is None and rest is not None:
         pose = rest.implant_to_world
     _check_size(files.mesh, mesh, config.pitch_mm)
+    if bends_elastically(config, files.material) and (number := num_shells(mesh)) > 1:
+        raise ValueError(f"mesh file {files.mesh}: {separate_bodies(number)}")
     return Implant(
         ImplantPointCloud.from_mesh(mesh, config.pitch_mm),
         components=[Component.of(screw, pitch=config.pitch_mm) for screw in screws],

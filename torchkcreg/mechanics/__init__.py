@@ -1,5 +1,6 @@
 """Finite-element mechanics of an implant without a body-fitted mesh: stiffness, displacements, loads, stresses."""
 
+from .bodies import num_shells, separate_bodies
 from .body import ElasticBody
 from .carried import CarriedLoad, node_stresses
 from .hexahedra import Hexahedra, edge_for
@@ -21,6 +22,8 @@ __all__ = [
     "edge_for",
     "holds_of",
     "node_stresses",
+    "num_shells",
+    "separate_bodies",
     "shares_of_holds",
     "stiffness_matrix",
     "von_mises",

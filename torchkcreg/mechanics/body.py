@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 from scipy.sparse import csr_array
 from torch import Tensor
 
@@ -14,6 +14,7 @@ from torchkcreg.geometry import invert_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.physics import ElasticConstants
 
+from .bodies import body_volumes, separate_bodies
 from .hexahedra import Hexahedra, edge_for, interpolated
 from .holds import rigid_fields
 from .stiffness import stiffness_matrix
@@ -33,6 +34,9 @@ class ElasticBody:
         constants: Elastic constants of its alloy.
         edge: Edge of the hexahedra, mm; `edge_for(cloud)` if None.
 
+    Raises:
+        ValueError: If the implant is several bodies that do not touch, or too loose for its elements.
+
     Attributes:
         hexahedra: The elements (cubes); displacements are given at their nodes, (..., N, 3), in the implant's axes, mm.
         filled: Metal volume in each cube, shape (E,), mm^3.
@@ -40,6 +44,9 @@ class ElasticBody:
     """
 
     def __init__(self, cloud: ImplantPointCloud, constants: ElasticConstants, *, edge: float | None = None) -> None:
+        if len(volumes := body_volumes(cloud)) > 1:
+            parts = " and ".join(f"{volume:.0f} mm^3" for volume in volumes[:3])
+            raise ValueError(f"{separate_bodies(len(volumes))} They have {parts}.")
         self.cloud, self.constants = cloud, constants
         self.hexahedra = Hexahedra.around(cloud, edge_for(cloud) if edge is None else edge)
         self.stiffness = stiffness_matrix(self.hexahedra, cloud, constants)
@@ -53,7 +60,13 @@ class ElasticBody:
         self._inertia = self.nodal_loads(coarse.points, rigid_fields(local) * coarse.volumes.double()[:, None])
         self._gram = torch.einsum("kni,lni->kl", self._inertia, self._rigid)
         self._pinned = _pinned(positions)
-        self._factor = cholesky_banded(_banded(self.stiffness, self._pinned), lower=True, overwrite_ab=True)
+        try:
+            self._factor = cholesky_banded(_banded(self.stiffness, self._pinned), lower=True, overwrite_ab=True)
+        except LinAlgError:
+            raise ValueError(
+                "the implant's stiffness is singular: parts of it hang together too loosely for its finite elements; "
+                "bend it with --deformation modes"
+            ) from None
 
     def nodal_loads(self, points: Tensor, forces: Tensor) -> Tensor:
         """Nodal loads (..., N, 3) equivalent to forces (..., P, 3) at points (P, 3); all in the lattice's axes.

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from scipy.sparse import coo_array, csr_array
 from torch import Tensor
 
+from torchkcreg.geometry import invert_rigid, transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.physics import ElasticConstants
 
@@ -14,6 +17,7 @@ from .hexahedra import NODES, Hexahedra
 
 _FILLING = 1e-7  # of the metal's stiffness: stiffness of the empty part of a cube
 _PLACES = 5
+_THINNEST = 1e-3  # of a cell: thinner parts are not cut off
 
 
 def stiffness_matrix(hexahedra: Hexahedra, cloud: ImplantPointCloud, constants: ElasticConstants) -> csr_array:
@@ -45,17 +49,51 @@ def _fitted_weights(hexahedra: Hexahedra, cloud: ImplantPointCloud, places: Tens
     """Weights (E, 125) of the Gauss points in each cube for integration over the metal in it (moment fitting).
 
     Products of two gradients of quadratic shape functions are polynomials of degree 4 along each axis, so five points
-    determine them. Their integral over the metal is the sum over these with weights `w_g = sum_n V_n L_g(x_n)`.
+    determine them. Their integral over the metal is the sum over these with weights `w_g = sum_n V_n L_g(x_n)`. Each
+    node stands for the metal in its cell, which is cut at the cubes' faces: as a point it would lack its second moment,
+    and a plate of thickness t would be too soft by (pitch / t)^2.
     """
-    cube, inside = hexahedra.locate(cloud.points)
+    centers, halves, volumes = _boxes(hexahedra, cloud)
+    cube, inside = hexahedra.locate(transform_points(hexahedra.frame, centers))
     order = cube.argsort(stable=True)
-    volumes, values = cloud.volumes.double()[order], _lagrange(inside[order], places)
+    reach = 2 * halves[order] / hexahedra.edge / math.sqrt(3)
+    near = [_lagrange(inside[order] + side * reach, places) for side in (-1, 1)]  # two Gauss points along each axis
     counts = torch.bincount(cube, minlength=len(hexahedra.cells)).tolist()
     weights = [
         torch.einsum("n,ni,nj,nk->ijk", chunk_volumes, *chunk.unbind(1)).flatten()
-        for chunk_volumes, chunk in zip(volumes.split(counts), values.split(counts), strict=True)
+        for chunk_volumes, chunk in zip(
+            volumes[order].split(counts), ((near[0] + near[1]) / 2).split(counts), strict=True
+        )
     ]
     return torch.stack(weights)
+
+
+def _boxes(hexahedra: Hexahedra, cloud: ImplantPointCloud) -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes of metal along the lattice's axes: centres and half edges (P, 3), mm, and volumes (P,), mm^3.
+
+    There is one for each node, or several where its cell reaches into several cubes. A node at the surface has the box
+    between the cell's far sides whose middle is the node, scaled to its volume.
+    """
+    points, volumes, cell = cloud.points.double(), cloud.volumes.double(), cloud.cell.double()
+    filled = volumes / torch.linalg.det(cell).abs()
+    in_cells = (points - points[filled.argmax()]) @ torch.linalg.inv(cell)  # that cell is full: its node is its middle
+    extents = (1 - 2 * (in_cells - in_cells.round()).abs()).clamp_min(_THINNEST)
+    extents = extents * (filled / extents.prod(1))[:, None] ** (1 / 3)
+    along = (cell @ hexahedra.frame[:3, :3]).square()  # squared edges in the lattice's axes: second moments add
+    halves = (extents.square() @ along).sqrt() / 2
+    centers = transform_points(invert_rigid(hexahedra.frame), points)
+    for axis in range(3):
+        low, high = centers[:, axis] - halves[:, axis], centers[:, axis] + halves[:, axis]
+        face = ((low / hexahedra.edge).floor() + 1) * hexahedra.edge
+        cut = high - face > _THINNEST * cloud.pitch
+        share = ((high - face) / (high - low))[cut]
+        beyond, beyond_halves = centers[cut].clone(), halves[cut].clone()
+        beyond[:, axis], beyond_halves[:, axis] = (face + high)[cut] / 2, (high - face)[cut] / 2
+        centers[cut, axis], halves[cut, axis] = (low + face)[cut] / 2, (face - low)[cut] / 2
+        beyond_volumes, volumes = volumes[cut] * share, volumes.masked_scatter(cut, volumes[cut] * (1 - share))
+        centers, halves = torch.cat([centers, beyond]), torch.cat([halves, beyond_halves])
+        volumes = torch.cat([volumes, beyond_volumes])
+    return centers, halves, volumes
 
 
 def _lagrange(inside: Tensor, places: Tensor) -> Tensor:

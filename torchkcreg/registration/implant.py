@@ -61,9 +61,7 @@ def deformation_of(implant: Implant, config: RegistrationConfig) -> Deformation:
         ValueError: If finite elements are asked for an implant whose material is not given, or has no known stiffness;
             if another model is asked for one whose shape without load is given.
     """
-    material = implant.material or config.material
-    known = material is not None and is_elastic(material)
-    if config.deformation == "fe" or (config.deformation == "auto" and known):
+    if bends_elastically(config, implant.material):
         return finite_elements(implant, config)
     if implant.rest is not None:
         raise ValueError("a shape without load is what finite elements bend: ask for them with --deformation fe")
@@ -71,6 +69,12 @@ def deformation_of(implant: Implant, config: RegistrationConfig) -> Deformation:
         implant.cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm, grows=config.grid_grows
     )
     return FreeFormDeformation(grid, prior=config.bending_prior)
+
+
+def bends_elastically(config: RegistrationConfig, material: str | None = None) -> bool:
+    """True if an implant of a material (default: that of the options) is bent by finite elements."""
+    named = material or config.material
+    return config.deformation == "fe" or (config.deformation == "auto" and named is not None and is_elastic(named))
 
 
 def finite_elements(implant: Implant, config: RegistrationConfig) -> FiniteElementDeformation:
