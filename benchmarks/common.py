@@ -41,21 +41,22 @@ def present(modules: Mapping[str, str]) -> tuple[list[str], list[str]]:
 def timed(steps: Mapping[Any, Callable[[], Any]], rounds: int) -> tuple[dict[Any, float], dict[Any, Any]]:
     """Best time of each step in seconds over some rounds after a warm-up, and the results of the warm-up.
 
-    In each round all steps run in turn. A step that takes more than `_SLOW` seconds runs only once, since the warm-up
-    hardly matters there.
+    In each round all steps run in turn. A step that takes more than `_SLOW` seconds runs in one round only, after its
+    warm-up, in which libraries compile and allocate.
     """
     best, results = {}, {}
     for key, run in steps.items():
         start = time.perf_counter()
         results[key] = run()
         best[key] = time.perf_counter() - start
-    quick = {key: run for key, run in steps.items() if best[key] < _SLOW}
-    best |= dict.fromkeys(quick, float("inf"))
-    for _ in range(rounds):
-        for key, run in quick.items():
-            start = time.perf_counter()
-            run()
-            best[key] = min(best[key], time.perf_counter() - start)
+    slow = {key for key, seconds in best.items() if seconds > _SLOW}
+    best = dict.fromkeys(best, float("inf"))
+    for number in range(rounds):
+        for key, run in steps.items():
+            if number == 0 or key not in slow:
+                start = time.perf_counter()
+                run()
+                best[key] = min(best[key], time.perf_counter() - start)
     return best, results
 
 

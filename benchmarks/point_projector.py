@@ -2,13 +2,17 @@
 
     python benchmarks/point_projector.py [--threads 2] [--rounds 3] [--binning 2] [--out benchmarks/results]
 
-The ten-hole plate in the paper's three views; all libraries render the same pixels. torchkcreg renders nodes with a
-footprint that is computed once, as in a registration. The other libraries render voxels of the size of the nodes'
-lattice, each with its share of metal, with one ray per pixel; nanodrr is also run with the average of several rays.
+The ten-hole plate in the paper's three views; all libraries render the same pixels. torchkcreg renders nodes; the
+calculation of their footprints is part of its time, though a registration does it once. The other libraries render
+voxels of the size of the nodes' lattice, each with its share of metal, with one ray per pixel; nanodrr is also run with
+the average of several rays. Libraries that sample rays take the fewest samples that are as accurate as many: a third
+table shows their time and error for each number. Rays are rendered in as few parts as the memory allows.
+
 torchkcreg's backward pass gives the gradient with respect to every node; the others' only with respect to the pose,
 which is less work. Errors are relative to the exact chords, averaged over pixels. A second table shows how the
 projector's speed depends on the number of nodes, views, candidates and threads. Libraries that are not installed are
-left out with a message. Writes point_projector.md and point_projector.png.
+left out with a message; TIGRE, LEAP and ASTRA project cone beams on GPUs only and have no rows. Writes
+point_projector.md and point_projector.png.
 """
 
 from __future__ import annotations
@@ -32,8 +36,9 @@ from torchkcreg.simulation import locking_plate
 PITCH = 0.25
 RAYS_AT_ONCE = 4096  # for Siddon's method, which stores every plane that a ray crosses
 FINER = 3
-BANDS = 8
-SAMPLES = 200  # per ray inside the volume, for nanodrr
+SAMPLES_AT_ONCE = 8_000_000  # bounds the memory for the gradient
+SAMPLE_NUMBERS = (10, 15, 25, 50, 100, 200, 400)  # along the part of a ray inside the volume
+AS_ACCURATE = 1.05  # times the error with the most samples
 Steps = dict[str, Callable[[], Tensor]]
 
 
@@ -73,9 +78,13 @@ class Scene:
 
 def ours(scene: Scene) -> Steps:
     projector, cloud = PointCloudProjector(scene.geometry), scene.cloud
-    footprint = cell_footprint(cloud.points, cloud.cell, scene.geometry.projection_matrices)
     points = cloud.points.clone().requires_grad_(True)
-    return both(lambda: projector(points, cloud.volumes, footprint=footprint), points, scene.upstream)
+
+    def images() -> Tensor:
+        footprint = cell_footprint(cloud.points, cloud.cell, scene.geometry.projection_matrices)
+        return projector(points, cloud.volumes, footprint=footprint)
+
+    return both(images, points, scene.upstream)
 
 
 def mesh(scene: Scene) -> Steps:
@@ -92,7 +101,7 @@ def rays(geometry: ConeBeamGeometry) -> tuple[Tensor, Tensor]:
     return sources[:, None], sources[:, None] + 600 * directions
 
 
-def nanodrr(scene: Scene, finer: int = 1) -> Steps:
+def nanodrr(scene: Scene, samples: int, finer: int = 1) -> Steps:
     """The camera is at the world origin, so sources and ray ends are given in world coordinates."""
     from nanodrr.data import Subject
     from nanodrr.drr.renderer import render
@@ -112,38 +121,44 @@ def nanodrr(scene: Scene, finer: int = 1) -> Steps:
     sources, ends = rays(scene.geometry.refined(finer))
     pose = torch.eye(4)[None].requires_grad_(True)
     _, rows, cols = scene.truth.shape
-    size, nothing = finer * (rows // BANDS), torch.eye(3)[None]  # bands limit the memory for the gradient
+    bands = next(
+        n for n in range(1, rows + 1) if rows % n == 0 and rows * cols * finer**2 * samples / n <= SAMPLES_AT_ONCE
+    )
+    size, nothing = finer * (rows // bands), torch.eye(3)[None]
 
     def band(view: int, number: int) -> Tensor:
         part = slice(number * size * cols * finer, (number + 1) * size * cols * finer)
         source, end = sources[view : view + 1], ends[view : view + 1, part]
         length = torch.ones(1)
-        image = render(subject, nothing, pose, length, size, cols * finer, n_samples=SAMPLES, src=source, tgt=end)
+        image = render(subject, nothing, pose, length, size, cols * finer, n_samples=samples, src=source, tgt=end)
         return avg_pool2d(image[0], finer)[0]
 
     def forward() -> Tensor:
         with torch.no_grad():
-            views = [torch.cat([band(view, number) for number in range(BANDS)]) for view in range(len(sources))]
+            views = [torch.cat([band(view, number) for number in range(bands)]) for view in range(len(sources))]
         return torch.stack(views)
 
     def backward() -> Tensor:
         total = torch.zeros_like(pose)
         for view, upstream in enumerate(scene.upstream):
-            for number, part in enumerate(upstream.chunk(BANDS)):
+            for number, part in enumerate(upstream.chunk(bands)):
                 total += torch.autograd.grad(band(view, number), pose, part)[0]
         return total
 
     return {"forward": forward, "and back": backward}
 
 
-def diffdrr(scene: Scene) -> Steps:
-    from diffdrr.renderers import Siddon
+def diffdrr(scene: Scene, samples: int | None = None) -> Steps:
+    """Siddon's exact method, or trilinear interpolation at a number of samples."""
+    from diffdrr.renderers import Siddon, Trilinear
 
     volume, affine = scene.voxels()
     back = affine.inverse().float()
     sources, ends = rays(scene.geometry)
     pose = torch.eye(4).expand(len(sources), 4, 4).clone().requires_grad_(True)
-    renderer, shape = Siddon(), scene.truth.shape
+    shape = scene.truth.shape
+    renderer, more = (Siddon(), {}) if samples is None else (Trilinear(), {"n_points": samples})
+    at_once = RAYS_AT_ONCE if samples is None else max(1, SAMPLES_AT_ONCE // (samples * len(sources)))
 
     def moved(points: Tensor) -> Tensor:
         to_voxels = back @ pose
@@ -151,9 +166,9 @@ def diffdrr(scene: Scene) -> Steps:
 
     def images() -> Tensor:
         parts = []
-        for chunk in ends.split(RAYS_AT_ONCE, dim=1):
+        for chunk in ends.split(at_once, dim=1):
             length = (chunk - sources).norm(dim=-1)[:, None]
-            parts.append(renderer(volume, moved(sources), moved(chunk), length)[:, 0])
+            parts.append(renderer(volume, moved(sources), moved(chunk), length, **more)[:, 0])
         return torch.cat(parts, dim=1).reshape(shape)
 
     return both(images, pose, scene.upstream)
@@ -173,15 +188,39 @@ LIBRARIES = {
     "torchkcreg": (ours, "torchkcreg"),
     "torchkcreg, mesh": (mesh, "torchkcreg"),
     "nanodrr": (nanodrr, "nanodrr"),
-    f"nanodrr, {FINER} x {FINER} rays": (lambda scene: nanodrr(scene, FINER), "nanodrr"),
+    f"nanodrr, {FINER} x {FINER} rays": (lambda scene, samples: nanodrr(scene, samples, FINER), "nanodrr"),
     "DiffDRR": (diffdrr, "diffdrr"),
+    "DiffDRR, trilinear": (diffdrr, "diffdrr"),
+}
+SAMPLED = {
+    "nanodrr": "nanodrr",
+    f"nanodrr, {FINER} x {FINER} rays": "nanodrr",
+    "DiffDRR, trilinear": "DiffDRR, trilinear",
 }
 
 
-def measure(scene: Scene, threads: int, rounds: int, names: list[str]) -> list[tuple[str, str, int, float, float]]:
+def sweep(scene: Scene, threads: int, names: list[str]) -> tuple[list[tuple[str, int, float, float]], dict[str, int]]:
+    """Forward time and error of each sampling library for each number of samples, and the number to use."""
+    torch.set_num_threads(threads)
+    rows, chosen = [], {}
+    for name in dict.fromkeys(SAMPLED[n] for n in names if n in SAMPLED):
+        errors = {}
+        for samples in SAMPLE_NUMBERS:
+            times, images = timed({0: LIBRARIES[name][0](scene, samples)["forward"]}, 1)
+            errors[samples] = scene.error(images[0])
+            rows.append((name, samples, times[0], errors[samples]))
+        limit = AS_ACCURATE * min(errors.values())
+        chosen[name] = next(samples for samples, error in errors.items() if error <= limit)
+    return rows, chosen
+
+
+def measure(
+    scene: Scene, threads: int, rounds: int, names: list[str], samples: dict[str, int]
+) -> list[tuple[str, str, int, float, float]]:
     """Table rows (step, library, threads, best seconds, error in per cent)."""
     torch.set_num_threads(threads)
-    made = {name: LIBRARIES[name][0](scene) for name in names}
+    numbers = {name: (samples[SAMPLED[name]],) if name in SAMPLED else () for name in names}
+    made = {name: LIBRARIES[name][0](scene, *numbers[name]) for name in names}
     times, images = timed({(name, step): run for name, steps in made.items() for step, run in steps.items()}, rounds)
     errors = {name: scene.error(images[name, "forward"]) for name in names}
     return [(step, name, threads, seconds, errors[name]) for (name, step), seconds in times.items()]
@@ -229,7 +268,16 @@ def roofline(scene: Scene, rate: float, rounds: int) -> str:
     )
 
 
-def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: list[str], limit: str) -> str:
+def table(
+    scene: Scene,
+    rows: list,
+    grown: list,
+    swept: list,
+    samples: dict[str, int],
+    names: list[str],
+    left_out: list[str],
+    limit: str,
+) -> str:
     modules = dict.fromkeys(module for name, (_, module) in LIBRARIES.items() if name in names)
     versions = [f"{module} {metadata.version(module)}" for module in ("torch", *modules) if module != "torchkcreg"]
     times = {(step, name, threads): seconds for step, name, threads, seconds, _ in rows}
@@ -249,14 +297,20 @@ def table(scene: Scene, rows: list, grown: list, names: list[str], left_out: lis
         lines.append(f"| {step} | {name} | {threads} | {seconds:.4f} | {ratio:.1f} | {error:.2f} |")
     lines += [
         "",
-        f"Error: root mean square against the exact chords, averaged over pixels; nanodrr takes {SAMPLES} samples per "
-        "ray inside the volume. Back: gradient to all nodes or vertices (torchkcreg), to the poses (other libraries).",
+        "Error: root mean square against the exact chords, averaged over pixels. Samples along a ray in the volume: "
+        + ", ".join(f"{number} ({name})" for name, number in samples.items())
+        + ", the fewest that are as accurate as the most accurate number (table below). torchkcreg's time contains "
+        "its footprints. Back: gradient to all nodes or vertices (torchkcreg), to the poses (other libraries).",
         "",
         "| what grows | to | million node-views a second |",
         "| --- | --- | --- |",
         *(f"| {what} | {number} | {rate:.0f} |" for what, number, rate in grown),
         "",
         limit,
+        "",
+        "| library | samples | seconds, forward | error, % |",
+        "| --- | --- | --- | --- |",
+        *(f"| {name} | {number} | {seconds:.3f} | {error:.2f} |" for name, number, seconds, error in swept),
         "",
     ]
     return "\n".join(lines)
@@ -299,10 +353,11 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     names, left_out = present({name: module for name, (_, module) in LIBRARIES.items()})
     scene = Scene(options.binning)
-    rows = [row for threads in options.threads for row in measure(scene, threads, options.rounds, names)]
+    swept, samples = sweep(scene, max(options.threads), names)
+    rows = [row for threads in options.threads for row in measure(scene, threads, options.rounds, names, samples)]
     grown = growth(scene, options.rounds)
     limit = roofline(scene, grown[-1][2], options.rounds)
-    text = table(scene, rows, grown, names, left_out, limit)
+    text = table(scene, rows, grown, swept, samples, names, left_out, limit)
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)
     write_report(options.out / "point_projector.md", text)

@@ -59,6 +59,13 @@ def test_a_figure_that_is_not_a_number_is_never_ok(name: str, value: object, exp
     assert f"{name} is not a number" in reasons
 
 
+def test_an_error_that_nothing_is_measured_with_fails_unless_a_single_view_leaves_depth_open() -> None:
+    status, reasons = judge(replace(GOOD, node_std_mm=3.3))
+    assert status == "failed" and "do not tell where the implant is" in reasons[0]
+    assert judge(replace(GOOD, node_std_mm=1.9))[0] == "doubtful"
+    assert judge(replace(GOOD, node_std_mm=3.3, gc=[0.95], seen=[1.0]))[0] == "doubtful"
+
+
 def test_a_view_that_hardly_shows_the_implant_is_named() -> None:
     status, (reason,) = judge(replace(GOOD, seen=[1.0, 0.1]))
     assert status == "doubtful"

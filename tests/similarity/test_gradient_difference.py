@@ -40,8 +40,22 @@ def test_a_flat_measured_view_says_nothing():
     fixed = images(2, 16, 16)
     fixed[1] = 0.7
     gd = GradientDifference(fixed)
-    assert gd(images(2, 16, 16).flip(-1))[1] == 1.0
-    assert torch.isfinite(gd.residuals(fixed)).all()
+    moving = images(2, 16, 16).flip(-1).requires_grad_(True)
+    gd(moving).sum().backward()
+    assert gd(moving)[1] == 0.0 and gd(fixed)[1] == 0.0 and gd(fixed)[0] == pytest.approx(1.0)
+    assert bool((moving.grad[1] == 0).all()) and bool((gd.residuals(fixed)[1] == 0).all())
+
+
+def test_a_view_masked_as_a_whole_agrees_with_nothing():
+    fixed, mask = images(2, 16, 16), torch.ones(2, 16, 16)
+    mask[1] = 0
+    gd = GradientDifference(fixed, mask)
+    assert gd(fixed).tolist() == [pytest.approx(1.0), 0.0]
+
+
+def test_a_ramp_is_half_of_a_perfect_match():
+    ramp = torch.arange(16.0).square().expand(1, 16, 16)  # flat along v
+    assert GradientDifference(ramp)(ramp).tolist() == [pytest.approx(0.5)]
 
 
 def test_gradients_agree_with_differences():

@@ -12,6 +12,7 @@ Status = Literal["ok", "doubtful", "failed"]
 _UNRELATED, _WEAK = 0.3, 0.6  # gradient correlation
 _NOTHING, _UNEXPLAINED = 0.2, 0.08  # misfit
 _DEVIATION_MM, _ANYWHERE_MM = 0.11, 0.5
+_USELESS_MM = 2.0  # no measurement of motion or bending is of use beyond it
 _DEVIATION_FOUND_MM = 0.085  # with found screws: their metal and shape may be wrong
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.0035  # root mean square strain
@@ -93,6 +94,11 @@ def _failures(diagnostics: Diagnostics) -> list[str]:
         reasons.append(
             f"{100 * diagnostics.misfit:.0f} % of the images' contrast is left unexplained and the nodes are expected "
             f"to be off by {diagnostics.node_std_mm:.1f} mm (RMS), as with images of something else"
+        )
+    if len(diagnostics.gc) > 1 and diagnostics.node_std_mm > _USELESS_MM:  # one view alone leaves depth open
+        reasons.append(
+            f"the implant's nodes are expected to be off by {diagnostics.node_std_mm:.1f} mm (RMS), more than "
+            f"{_USELESS_MM:g} mm: the images do not tell where the implant is"
         )
     if max(diagnostics.seen) < _SEEN:
         reasons.append(f"no view shows more than {100 * max(diagnostics.seen):.0f} % of the implant")

@@ -224,7 +224,8 @@ class GradientDifference(OfGradients):
     `GD = 1 - sum_d |d y - d y*|^2 / (4 |d y*|^2)` over the Sobel derivatives d along u and v, without their means.
     Near a match it agrees with gradient correlation (eq. 4 of Cao et al. 2020). Gradient correlation ignores a factor
     of the contrast; here a wrong contrast lowers the similarity. So scatter (which lowers contrast) and hardness can be
-    distinguished from motion.
+    distinguished from motion. A flat derivative of a measured view, or a view masked as a whole, agrees with nothing:
+    it contributes 0, with zero gradient.
 
     Args:
         fixed: Measured images, shape (V, rows, cols), finite inside the mask.
@@ -240,6 +241,7 @@ class GradientDifference(OfGradients):
     """
 
     inverse_norms: Tensor
+    best: Tensor
 
     def __init__(self, fixed: Tensor, mask: Tensor | None = None, weights: Tensor | None = None) -> None:
         super().__init__(fixed, mask, weights)
@@ -250,13 +252,18 @@ class GradientDifference(OfGradients):
         flat = norms <= rounding * largest_value(seen)[:, None, None, None]
         self.register_buffer("inverse_norms", torch.where(flat, 0.0, 1 / norms))
         self.register_buffer("unit_gradients", contrast * self.inverse_norms)
+        self.register_buffer("best", 1 - 0.5 * flat.sum((-3, -2, -1)))
 
     def forward(self, moving: Tensor) -> Tensor:
         """GD of each view, shape (..., V), of rendered images (..., V, rows, cols)."""
-        return self.in_blocks(lambda block: 1 - 0.25 * self._residuals(block).square().sum((-3, -2, -1)), moving)
+        misfit = self.in_blocks(lambda block: 0.25 * self._residuals(block).square().sum((-3, -2, -1)), moving)
+        return self.best - misfit
 
     def residuals(self, moving: Tensor) -> Tensor:
-        """Normalised gradient differences (..., V, 2, rows, cols), whose squares sum to 4 (1 - GD)."""
+        """Normalised gradient differences (..., V, 2, rows, cols), whose squares sum to 4 (1 - GD).
+
+        Those of a flat derivative are 0: it says nothing about the motion.
+        """
         return self.in_blocks(self._residuals, moving)
 
     def _residuals(self, moving: Tensor) -> Tensor:

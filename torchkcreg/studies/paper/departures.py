@@ -42,7 +42,7 @@ def departures(material: str) -> dict[str, Settings]:
         "screws as components": Settings(paper, screws=True),
         "polyenergetic DRRs": Settings(physical, spectrum=True),
         "screws and polyenergetic DRRs": Settings(physical, screws=True, spectrum=True),
-        "the same, background and physics estimated": Settings(
+        "both, background and physics estimated": Settings(
             {**physical, "stages": _written(estimated)}, screws=True, spectrum=True
         ),
         "elastic energy in the objective": Settings({**paper, "stiffness": 30.0}),
