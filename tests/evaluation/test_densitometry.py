@@ -75,7 +75,7 @@ def test_what_cannot_be_measured_is_refused(folder, capsys):
         == 2
     )
     assert "too few to measure" in capsys.readouterr().err
-    other = VolumeGrid.centered(GRID.shape, 1.0, center=(5.0, 0.0, 0.0))
+    other = VolumeGrid.centered(GRID.shape, 1.0, center=(5.3, 0.0, 0.0))
     write_volume(folder / "labels.mha", torch.ones(GRID.shape, dtype=torch.int32), other)
     assert main(["densitometry", str(folder), "--labels", str(folder / "labels.mha")]) == 2
     assert "must lie on the reconstruction's voxels" in capsys.readouterr().err
@@ -125,3 +125,22 @@ def test_a_folder_that_does_not_say_what_was_measured_is_doubted(folder):
     (folder / "measured.mha").unlink()
     with pytest.warns(UserWarning, match="does not tell which voxels were measured"):
         densitometry_files(folder, folder / "d", cylinders=[(5, 0, -4, 5, 0, 4, 3)], figures=False)
+
+
+def test_labels_may_lie_on_a_cropped_or_turned_lattice_of_the_same_voxels(folder, recwarn):
+    whole = torch.zeros(GRID.shape, dtype=torch.int32)
+    whole[2:8, 2:6, 13:18] = 3
+    write_volume(folder / "whole.nii.gz", whole, GRID)
+    (expected,) = densitometry_files(folder, folder / "d", labels=folder / "whole.nii.gz", figures=False)
+    x, y, z = GRID.origin
+    cropped = VolumeGrid((8, 6, 10), GRID.spacing, (x + 10, y, z + 1))
+    write_volume(folder / "cropped.nrrd", whole[1:9, :6, 10:], cropped)
+    turned = VolumeGrid(GRID.shape, GRID.spacing, (-x, -y, z), ((-1, 0, 0), (0, -1, 0), (0, 0, 1)))
+    write_volume(folder / "turned.nrrd", whole.flip(1, 2), turned)
+    for name in ("cropped.nrrd", "turned.nrrd"):
+        (content,) = densitometry_files(folder, folder / "d", labels=folder / name, figures=False)
+        assert content == expected
+    shifted = VolumeGrid(GRID.shape, GRID.spacing, (x + 0.3, y, z))
+    write_volume(folder / "shifted.nrrd", whole, shifted)
+    with pytest.raises(ValueError, match="must lie on the reconstruction's voxels"):
+        densitometry_files(folder, folder / "d", labels=folder / "shifted.nrrd", figures=False)

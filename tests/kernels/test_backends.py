@@ -1,12 +1,15 @@
 """Which backend serves a request, and that one more is a line in the table."""
 
+import threading
 import warnings
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from filelock import FileLock
 
-from torchkcreg.kernels import BACKENDS, Backend, Operator, backend_names, choose_backend, kernel
+from torchkcreg.kernels import BACKENDS, Backend, Operator, backend_names, choose_backend, extension, kernel
 
 TWICE = Operator("twice_for_tests(Tensor x) -> Tensor", reference=lambda x: 2 * x, fake=torch.empty_like)
 
@@ -57,3 +60,36 @@ def test_auto_says_once_that_it_falls_back_to_the_slow_reference() -> None:
         choose_backend(of_device("xpu"))
         choose_backend(of_device("hpu"), "torch")  # asked for by name
         choose_backend(of_device("meta"))
+
+
+def test_the_lock_of_a_killed_compilation_stops_nobody(monkeypatch, tmp_path):
+    from torch.utils import cpp_extension
+
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    folder = tmp_path / f"{extension.NAME}_{torch.__version__}"
+    folder.mkdir()
+    (folder / "lock").write_text("")  # torch waits for it to vanish
+    seen = []
+    monkeypatch.setattr(
+        cpp_extension, "load", lambda *_a, build_directory, **_k: seen.append((Path(build_directory) / "lock").exists())
+    )
+    extension._load_compiled()
+    assert seen == [False]
+
+
+def test_waiting_for_another_compilation_is_said(monkeypatch, tmp_path, caplog):
+    monkeypatch.setattr(extension, "PATIENCE_SECONDS", 0.05)
+    held, ended = threading.Event(), threading.Event()
+
+    def compiles() -> None:
+        with FileLock(tmp_path / "lock"):
+            held.set()
+            ended.wait(0.5)
+
+    other = threading.Thread(target=compiles)
+    other.start()
+    held.wait()
+    with caplog.at_level("WARNING"), extension.only_one(tmp_path / "lock"):
+        pass
+    other.join()
+    assert "another process compiles torchkcreg's kernels" in caplog.text

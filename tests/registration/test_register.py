@@ -190,3 +190,11 @@ def test_a_result_warps_points_and_flags_those_outside_the_grid() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 500.0]])
     torch.testing.assert_close(result.warp(points), transform_points(pose(1, 2), points.double()))
     assert result.outside(points).tolist() == [False, True]
+
+
+def test_a_registration_needs_no_gradients_from_around_it() -> None:
+    truth = pose(2, 2)
+    with torch.no_grad():
+        result = register(plate(), image(scene(PLAIN, truth)), PLAIN)
+    points = plate().points.double()
+    assert float((result.warp(points) - transform_points(truth, points)).norm(dim=-1).max()) < 0.05

@@ -188,3 +188,14 @@ def test_blocks_of_one_side_and_found_screws_widen_the_covariance() -> None:
     torch.testing.assert_close(covariance(views_a_side=3.0), 3 * alone)
     torch.testing.assert_close(covariance(screws_found=True), 1.5**2 * alone)
     torch.testing.assert_close(covariance(screws_found=True, views_a_side=4.0), 8 * 1.5**2 * alone)
+
+
+def test_a_panel_that_is_sharper_than_its_pixels_says_nothing() -> None:
+    physical = RegistrationConfig(material="steel", stages=(Stage(estimate=("scatter", "blur")),))
+    here = scene(physical)
+    with torch.no_grad():
+        here.intensity.get_parameter("blur_sigma_px").fill_(0.1)
+    assert PhysicsParameters(here.intensity, ("scatter", "blur"), 1.0, 1.0).at_bounds(0.01) == []
+    with torch.no_grad():
+        here.intensity.get_parameter("blur_sigma_px").fill_(5.0)
+    assert PhysicsParameters(here.intensity, ("scatter", "blur"), 1.0, 1.0).at_bounds(0.01) == ["blur"]

@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from torchkcreg.evaluation import MineralContent, cylinder_region, distance_to, mineral_content
-from torchkcreg.geometry import VolumeGrid
+from torchkcreg.geometry import VolumeGrid, transform_points
 from torchkcreg.io import read_json, read_volume, write_figure, write_json
 from torchkcreg.physics import calcium_of
 from torchkcreg.visualization import reconstruction_figure
 
 _NO_BONE_MG_ML = 900.0  # cortical bone has 450, enamel 1100
 _ROUNDED = 0.1  # a cylinder's voxels may add up to so much less than its volume
+_OFF_VOXEL = 0.01  # of a voxel
 _NOTICEABLE = 0.005
 _METAL = 0.05  # a voxel is metal if the implant adds more than this fraction of its largest added attenuation
 
@@ -168,9 +169,31 @@ def _labelled(path: Path | None, grid: VolumeGrid) -> dict[str, Tensor]:
     if path is None:
         return {}
     labels, its_grid = read_volume(path)
-    if labels.shape != tuple(grid.shape) or not its_grid.lies_on(grid):
-        raise ValueError(f"label map {path} must lie on the reconstruction's voxels: resample it there")
     numbers = [int(n) for n in labels.unique().tolist() if n > 0]
     if bool((labels != labels.round()).any()) or not numbers:
         raise ValueError(f"label map {path} must hold whole numbers, and some above zero")
-    return {f"label {n}": labels == n for n in numbers}
+    placed = _placed(labels, its_grid, grid)
+    if placed is None:
+        raise ValueError(f"label map {path} must lie on the reconstruction's voxels: resample it there")
+    absent = [n for n in numbers if not bool((placed == n).any())]
+    if absent:
+        raise ValueError(f"label map {path}: label {absent[0]} lies outside the reconstruction")
+    return {f"label {n}": placed == n for n in numbers}
+
+
+def _placed(labels: Tensor, its_grid: VolumeGrid, grid: VolumeGrid) -> Tensor | None:
+    """Labels on the voxels of a grid, from the same voxels cropped, turned or in another order; None if from others."""
+    index = labels.nonzero()
+    points = transform_points(its_grid.voxel_to_world.double(), index.flip(-1).double())
+    places = transform_points(grid.world_to_voxel.double(), points)
+    same_size = abs(its_grid.voxel_volume - grid.voxel_volume) < 1e-3 * grid.voxel_volume
+    if not same_size or bool(((places - places.round()).abs() > _OFF_VOXEL).any()):
+        return None
+    place = places.round().long().flip(-1)
+    inside = ((place >= 0) & (place < torch.tensor(grid.shape))).all(-1)
+    if not bool(inside.all()):
+        share = float((~inside).double().mean())
+        warnings.warn(f"{100 * share:.0f} % of the label map's regions lie beyond the volume", stacklevel=4)
+    placed = torch.zeros(tuple(grid.shape), dtype=labels.dtype)
+    placed[tuple(place[inside].T)] = labels[tuple(index[inside].T)]
+    return placed

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 
+log = logging.getLogger(__name__)
+NAME = "torchkcreg_kernels"
+PATIENCE_SECONDS = 5.0
 PACKAGE = Path(__file__).resolve().parent.parent
 SOURCES = (
     "csrc/cpu/blur.cpp",
@@ -77,9 +82,33 @@ def _load_compiled() -> None:
     missing = [str(source) for source in sources if not source.is_file()]
     if missing:
         raise FileNotFoundError(f"no source {missing[0]}")
-    cpp_extension.load(
-        "torchkcreg_kernels",
-        [str(source) for source in sources],
-        extra_cflags=[*COMPILE_FLAGS, *DEFINES],
-        is_python_module=False,
-    )
+    root = os.environ.get("TORCH_EXTENSIONS_DIR") or cpp_extension.get_default_build_root()
+    folder = Path(root) / f"{NAME}_{torch.__version__}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with only_one(folder / "torchkcreg.lock"):
+        # whoever compiles holds our lock, so a lock of torch's is that of a process that was killed
+        (folder / "lock").unlink(missing_ok=True)
+        cpp_extension.load(
+            NAME,
+            [str(source) for source in sources],
+            extra_cflags=[*COMPILE_FLAGS, *DEFINES],
+            build_directory=str(folder),
+            is_python_module=False,
+        )
+
+
+@contextmanager
+def only_one(lock: Path) -> Iterator[None]:
+    """Hold a lock file that ends with its process; says so once if another process holds it for long."""
+    from filelock import FileLock, Timeout  # torch requires it
+
+    held = FileLock(lock)
+    try:
+        held.acquire(timeout=PATIENCE_SECONDS)
+    except Timeout:
+        log.warning("another process compiles torchkcreg's kernels: waiting for it (%s)", lock)
+        held.acquire()
+    try:
+        yield
+    finally:
+        held.release()

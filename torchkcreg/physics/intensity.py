@@ -38,6 +38,7 @@ class FreeParameter:
         likely: Most likely value.
         deviation: Standard deviation about the most likely value.
         in_pixels: True if it is a length in pixels.
+        ends_at_low: True if the lower bound is a limit of physics, not of what is plausible: to end there is no flaw.
     """
 
     attribute: str
@@ -47,6 +48,7 @@ class FreeParameter:
     likely: float
     deviation: float
     in_pixels: bool = False
+    ends_at_low: bool = False
 
 
 class IntensityModel(nn.Module):
@@ -168,6 +170,7 @@ class PolyenergeticTransmission(IntensityModel):
                     blur_sigma_px,
                     max(_LIKELY_BLUR * blur_sigma_px, _LEAST_LIKELY_BLUR_PX),
                     in_pixels=True,
+                    ends_at_low=True,  # a panel sharper than its pixels
                 ),
                 "hardness": FreeParameter(
                     "hardness", 2.0, -5.0, 20.0, hardness, _LIKELY_HARDNESS_MM[spectrum_is_known]

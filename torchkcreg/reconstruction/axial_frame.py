@@ -43,7 +43,10 @@ def axial_frame(geometry: ConeBeamGeometry) -> AxialFrame:
     sources = geometry.source_positions.double()
     radii = sources[:, :2].norm(dim=1)
     if bool((radii < 1e-6).any()):
-        raise ValueError(f"view {int(radii.argmin())} has its source on the axis of rotation (the world's z axis)")
+        raise ValueError(
+            f"view {int(radii.argmin())} has its source on the axis of rotation (the world's z axis): if the gantry "
+            "rotates about another axis, such as y in RTK's world, give --gantry-axis to torchkcreg convert"
+        )
     across, up, inward = _axes(sources, radii)
     frame = torch.stack([radii[:, None] * across, radii[:, None] * up, inward], dim=1)
     to_virtual = frame @ torch.linalg.inv(geometry.projection_matrices[:, :, :3])

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
+import torch
 from tqdm import tqdm
 
 from torchkcreg.callbacks import Callback
@@ -220,8 +221,9 @@ class Trainer:
         """End the registration after the current iteration; the result gives the reason."""
         self.stopped = reason
 
+    @torch.enable_grad()
     def fit(self) -> RegistrationResult:
-        """Run the remaining stages and return the result."""
+        """Run the remaining stages and return the result, with gradients even inside `torch.no_grad()`."""
         self.run()
         return finished(
             self.scene,

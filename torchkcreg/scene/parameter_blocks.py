@@ -67,10 +67,11 @@ class PhysicsParameters(ParameterBlock):
         return torch.minimum(torch.maximum(steps, self.low), self.high)
 
     def at_bounds(self, share: float) -> list[str]:
-        """Names of parameters within this share of their range of a bound that is not their most likely value."""
+        """Names of parameters within this share of their range of a bound that is neither likely nor physical."""
         margin = share * (self.high - self.low)
         likely = (self.center - self.start) / self.scale
-        near = ((self.low > -margin) & (likely > self.low)) | ((self.high < margin) & (likely < self.high))
+        plausible = torch.tensor([f.ends_at_low for f in self.free], dtype=torch.bool, device=self.low.device)
+        near = ((self.low > -margin) & (likely > self.low) & ~plausible) | ((self.high < margin) & (likely < self.high))
         return [name for name, is_near in zip(self.names, near.tolist(), strict=True) if is_near]
 
     def values(self, steps: Tensor) -> Tensor:
