@@ -77,6 +77,25 @@ def test_a_registration_finds_most_of_the_motion(small_case, finished, tmp_path)
     torch.testing.assert_close(warped, read_run(finished).warp(before), rtol=0, atol=1e-6)
 
 
+def test_warping_replaces_its_own_tables_and_nothing_else(finished, small_case, tmp_path, capsys):
+    points, out = tmp_path / "points.csv", tmp_path / "out.csv"
+    points.write_text((small_case / "before.csv").read_text())
+    arguments = ["warp", f"--run={finished}", f"--points={points}"]
+    assert main([*arguments, f"--out={out}"]) == 0
+    first = out.read_text()
+    assert main([*arguments, f"--out={out}"]) == 0 and out.read_text() == first
+    before = points.read_text()
+    for more in ([], ["--overwrite"]):
+        assert main([*arguments, f"--out={points}", *more]) == 2
+        assert "holds the points themselves" in capsys.readouterr().err
+    assert points.read_text() == before
+    other = tmp_path / "mine.csv"
+    other.write_text("x,y,z\n1,2,3\n")
+    assert main([*arguments, f"--out={other}"]) == 2
+    assert "is there already" in capsys.readouterr().err and other.read_text() == "x,y,z\n1,2,3\n"
+    assert main([*arguments, f"--out={other}", "--overwrite"]) == 0 and other.read_text() == first
+
+
 def test_warp_flags_points_beyond_the_implant(finished, tmp_path, capsys):
     (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n0,0,500\n")
     assert (

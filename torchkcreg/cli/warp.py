@@ -21,7 +21,9 @@ def add_warp(commands) -> None:
     command.add_argument(
         "--implant-name", help="which implant the points belong to, if the run has several (name of its mesh file)"
     )
-    command.add_argument("--overwrite", action="store_true", help="replace the file to write if it exists")
+    command.add_argument(
+        "--overwrite", action="store_true", help="replace any file; without it only a table of warped points"
+    )
 
 
 def _warp(options: argparse.Namespace) -> Answer:

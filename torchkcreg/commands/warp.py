@@ -7,7 +7,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchkcreg.io import read_points, read_run, write_points
+from torchkcreg.io import implant_of_run, is_points_table, read_points, write_points
+
+FLAG = "outside"  # column of the points beyond the implant's reach
 
 
 def warp_files(
@@ -25,21 +27,21 @@ def warp_files(
         points_file: Table of x, y, z in the undeformed implant's frame, mm.
         out: Table to write: x, y, z in the world, `outside`, and `lateral_std_mm`, `depth_std_mm` if the run has them.
         implant_name: Name of the implant to which the points belong, if the run has several.
-        overwrite: Replace the table if it exists; the points themselves are never replaced.
+        overwrite: Replace any file. Without it only a table that this command wrote is replaced; the points themselves
+            never are.
 
     Raises:
-        FileExistsError: If the table exists, or is the file of the points.
+        FileExistsError: If the table would replace another file, or the points.
         ValueError: If the run has no implant of that name, or a file cannot be read.
     """
+    points = read_points(points_file)
     if out.exists() and out.samefile(points_file):
         raise FileExistsError(f"{out} holds the points themselves: name another file to write")
-    if out.exists() and not overwrite:
-        raise FileExistsError(f"{out} is there already: name another file, or overwrite it")
-    result, points = read_run(run_folder), read_points(points_file)
-    try:
-        implant = result.implant(implant_name)
-    except ValueError as error:
-        raise ValueError(f"run folder {run_folder}: {error}") from None
+    if out.exists() and not overwrite and not is_points_table(out, FLAG):
+        raise FileExistsError(
+            f"{out} is there already and no table of warped points: name another file, or overwrite it"
+        )
+    _, implant = implant_of_run(run_folder, implant_name)
     outside = implant.outside(points)
     if outside.any():
         warnings.warn(
@@ -47,7 +49,7 @@ def warp_files(
             "they move rigidly with its nearest part",
             stacklevel=1,
         )
-    columns = {"outside": outside}
+    columns = {FLAG: outside}
     if implant.deviations is not None:
         columns |= dict(zip(("lateral_std_mm", "depth_std_mm"), implant.deviations.split(points), strict=True))
     write_points(out, implant.warp(points), **columns)

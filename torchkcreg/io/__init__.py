@@ -39,7 +39,7 @@ from .scans import (
     write_projections,
     write_stack,
 )
-from .tables import read_points, read_spectrum, write_points, write_spectrum
+from .tables import is_points_table, read_points, read_spectrum, write_points, write_spectrum
 from .transforms import displacement_field, itk_transform, write_displacement_field, write_itk_transform
 from .volumes import read_volume, write_volume
 
@@ -58,6 +58,7 @@ __all__ = [
     "image_header",
     "implant_of_run",
     "implausible_magnification",
+    "is_points_table",
     "itk_transform",
     "mesh_of_run",
     "read_components",

@@ -214,6 +214,13 @@ def write_points(path: str | os.PathLike[str], points: Tensor, **columns: Tensor
     write_text(path, "\n".join(lines) + "\n")
 
 
+def is_points_table(path: str | os.PathLike[str], column: str) -> bool:
+    """True if a file is a table that `write_points` wrote with this first further column."""
+    begin = f"x,y,z,{column}".encode()
+    with open(path, "rb") as file:
+        return file.read(len(begin)) == begin
+
+
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     """Read a spectrum from a text table: energy in keV and detected weight (arbitrary scale).
 
