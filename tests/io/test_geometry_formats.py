@@ -277,3 +277,22 @@ def test_meshes_and_projections_are_converted_by_the_targets_ending(tmp_path, ca
     for target in ("lines.npz", "lines.tif"):
         assert main(["convert", str(tmp_path / "lines.mha"), str(tmp_path / target)]) == 2
         assert "line integrals as .mha, .nrrd" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("spacing", "origin", "flags", "expected"),
+    [
+        ((2.0, 2.0), (-30.0, -39.0), [], ((2.0, 2.0), (-30.0, -39.0))),
+        ((2.0, 2.0), (-30.0, -39.0), ["--pixel-pitch", "2"], ((2.0, 2.0), (-30.0, -39.0))),
+        ((1.0, 1.0), (0.0, 0.0), ["--pixel-pitch", "2"], ((2.0, 2.0), (-59.0, -39.0))),  # no header: centred
+    ],
+)
+def test_a_converted_stack_keeps_where_its_detector_is(tmp_path, spacing, origin, flags, expected):
+    stack = sitk.GetImageFromArray(np.full((3, 40, 60), 30000, np.uint16))
+    stack.SetSpacing((*spacing, 1.0))
+    stack.SetOrigin((*origin, 0.0))
+    sitk.WriteImage(stack, str(tmp_path / "stack.mha"))
+    arguments = ["convert", str(tmp_path / "stack.mha"), str(tmp_path / "lines.mha"), "--open-beam", "65535"]
+    assert main([*arguments, *flags]) == 0
+    lines = sitk.ReadImage(str(tmp_path / "lines.mha"))
+    assert (lines.GetSpacing()[:2], lines.GetOrigin()[:2]) == expected

@@ -10,7 +10,6 @@ import torch
 from torchkcreg.geometry import gantry_about_z
 from torchkcreg.io import (
     WRITTEN_SUFFIXES,
-    image_header,
     read_geometry,
     read_mesh,
     read_projections,
@@ -68,9 +67,8 @@ def convert(
     if target.name.lower().endswith(IMAGE_SUFFIXES):
         stack = read_projections(source, open_beam=open_beam)
         lines = torch.where(stack.mask, stack.line_integrals, torch.nan)
-        kept = image_header(source) if source.is_file() else None
-        origin = None if kept is None else kept.origin_mm
-        write_stack(target, lines, spacing or (stack.header.spacing if stack.header else None), origin)
+        kept = (stack.header.spacing, stack.header.origin_mm) if stack.header else (None, None)
+        write_stack(target, lines, spacing or kept[0], kept[1])
         masked = f"; {note}" if (note := stack.masked_note()) else ""
         return f"line integrals of {len(lines)} views of {lines.shape[1]} x {lines.shape[2]} pixels: {target}{masked}"
     if target.suffix.lower() not in GEOMETRY_SUFFIXES or source.name.lower().endswith(IMAGE_SUFFIXES):

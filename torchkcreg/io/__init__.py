@@ -33,7 +33,6 @@ from .runs import (
 from .scans import (
     ProjectionFile,
     Projections,
-    image_header,
     implausible_magnification,
     read_projections,
     write_projections,
@@ -55,7 +54,6 @@ __all__ = [
     "displacement_field",
     "geometry_from_dict",
     "geometry_to_dict",
-    "image_header",
     "implant_of_run",
     "implausible_magnification",
     "is_points_table",

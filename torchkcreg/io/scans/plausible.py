@@ -59,23 +59,26 @@ def stuck_pixels(image: NDArray, saturated: NDArray[np.bool_], ceiling: float) -
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Pixel spacing and axes from the header of an image file.
+    """Pixel spacing, origin and axes from the header of an image file.
 
     Attributes:
         spacing: (dv, du) in mm.
+        origin_mm: (u, v) of the centre of pixel (0, 0).
         turned: True if the direction matrix is not the identity.
     """
 
     spacing: tuple[float, float]
+    origin_mm: tuple[float, float]
     turned: bool
 
     @classmethod
     def of(cls, image: sitk.Image | sitk.ImageFileReader) -> ImageHeader | None:
-        """The header of an image stack or of its reader; None for the default of 1 x 1 mm and unrotated axes."""
-        du, dv = image.GetSpacing()[:2]
+        """The header of an image stack or of its reader; None for the default of 1 x 1 mm, no origin, unrotated axes."""
+        (du, dv), origin = image.GetSpacing()[:2], image.GetOrigin()[:2]
         size = image.GetDimension()
         turned = not np.allclose(np.reshape(image.GetDirection(), (size, size)), np.eye(size), atol=1e-3)
-        return None if du == dv == 1.0 and not turned else cls((dv, du), turned)
+        is_default = du == dv == 1.0 and origin == (0.0, 0.0) and not turned
+        return None if is_default else cls((dv, du), origin, turned)
 
     def check_against(self, geometry: ConeBeamGeometry) -> None:
         """Warn if the pixel spacing differs from the geometry's, or if the axes are rotated or flipped."""
