@@ -14,7 +14,10 @@ from torchkcreg.registration.implant import deformation_of
 
 HOLDS = [Hold(f"at {z:.0f}", (0.0, 0.0, z), 4.0) for z in (-22.0, -7.0, 7.0, 22.0)]
 BENDING = Stage(groups=20, modes=12, oversampling=1, tolerance=1e-4)
-CONFIG = RegistrationConfig(stages=(*RIGID, BENDING), deformation="fe", hold_weight=1e-9)
+# Twice the default loads are expected, so that the images say more about the load than its prior does.
+CONFIG = RegistrationConfig(
+    stages=(*RIGID, BENDING), deformation="fe", hold_weight=1e-9, hold_force_n=400.0, hold_moment_nmm=3000.0
+)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +46,7 @@ def test_the_truth_lies_about_as_far_off_as_the_loads_say(found) -> None:
     off = carried.hold_loads - loads @ torch.block_diag(carried.axes, carried.axes).mT
     assert float((off.abs() / carried.hold_std).max()) < 4
     nothing_seen = CarriedLoad.of(result.deformation.superelement, result.deformation.amounts.detach())
-    assert float((carried.section_std / nothing_seen.section_std)[60, [3, 5]].max()) < 0.98  # less than without images
+    assert float((carried.section_std / nothing_seen.section_std)[60, [3, 5]].max()) < 0.9  # less than without images
 
 
 def test_a_run_folder_keeps_the_body_beside_its_json(found, tmp_path) -> None:

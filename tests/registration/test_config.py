@@ -21,6 +21,7 @@ def test_the_paper_preset_has_the_papers_settings_and_nothing_beside_them() -> N
     start, rigid, *bending = config.schedule()
     assert start.level.is_rigid and rigid.level.is_rigid
     assert [stage.groups for stage in bending] == [2, 4, 6, 8, 10]  # section 2.4
+    assert start.optimizer == "cmaes"
     for stage in (rigid, *bending):
         assert (stage.optimizer, stage.population, stage.iterations) == ("cmaes", 40, 400)  # section 2.3
     for stage in config.schedule():

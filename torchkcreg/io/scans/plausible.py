@@ -73,7 +73,7 @@ class ImageHeader:
 
     @classmethod
     def of(cls, image: sitk.Image | sitk.ImageFileReader) -> ImageHeader | None:
-        """The header of an image stack or of its reader; None for the default of 1 x 1 mm, no origin, unrotated axes."""
+        """The header of an image stack or of its reader; None for the default: 1 x 1 mm, no origin, not turned."""
         (du, dv), origin = image.GetSpacing()[:2], image.GetOrigin()[:2]
         size = image.GetDimension()
         turned = not np.allclose(np.reshape(image.GetDirection(), (size, size)), np.eye(size), atol=1e-3)
