@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,11 +65,11 @@ def densitometry_files(
     apart = distance_to(metal, grid) >= max(from_metal_mm, 1e-9)
     seen = _seen(reconstruction, grid)
     usable = apart & seen
+    beyond = [_beyond(*pair, grid) for pair in zip(cylinders, regions.values(), strict=False)]  # cylinders come first
+    beyond += [0.0] * (len(regions) - len(cylinders))
     contents = [
-        replace(content, left_out=_left_out(name, content, cylinder, regions[name], grid, apart, seen))
-        for (name, cylinder), content in zip(
-            _named(cylinders, regions), mineral_content(calcium, regions, grid, usable=usable), strict=True
-        )
+        replace(content, left_out=_left_out(content, regions[content.name], voxels, apart, seen))
+        for content, voxels in zip(mineral_content(calcium, regions, grid, usable=usable), beyond, strict=True)
     ]
     out.mkdir(parents=True, exist_ok=True)
     record = {
@@ -98,36 +98,24 @@ def _record(content: MineralContent) -> dict[str, float | str | int]:
     return {**vars(content), "hydroxyapatite_mg_ml": content.hydroxyapatite_mg_ml, "content_mg": content.content_mg}
 
 
-def _named(
-    cylinders: Sequence[Sequence[float]], regions: Mapping[str, Tensor]
-) -> list[tuple[str, Sequence[float] | None]]:
-    """Name of each region, and its cylinder if it is one."""
-    shapes = [*cylinders, *[None] * (len(regions) - len(cylinders))]
-    return list(zip(regions, shapes, strict=True))
+def _beyond(cylinder: Sequence[float], region: Tensor, grid: VolumeGrid) -> float:
+    """Number of voxels by which a cylinder reaches beyond the volume; 0 if its voxels are only rounded."""
+    ends = torch.tensor([cylinder[:3], cylinder[3:6]], dtype=torch.float64)
+    whole = math.pi * cylinder[6] ** 2 * float((ends[1] - ends[0]).norm()) / grid.voxel_volume
+    inside = float(region.sum())
+    return whole - inside if whole > (1 + _ROUNDED) * inside else 0.0
 
 
-def _left_out(
-    name: str,
-    content: MineralContent,
-    cylinder: Sequence[float] | None,
-    region: Tensor,
-    grid: VolumeGrid,
-    apart: Tensor,
-    seen: Tensor,
-) -> float:
+def _left_out(content: MineralContent, region: Tensor, beyond: float, apart: Tensor, seen: Tensor) -> float:
     """Share of a region that is not measured; a warning says why."""
-    inside, whole = float(region.sum()), float(region.sum())
-    if cylinder is not None:
-        ends = torch.tensor([cylinder[:3], cylinder[3:6]], dtype=torch.float64)
-        solid = math.pi * cylinder[6] ** 2 * float((ends[1] - ends[0]).norm()) / grid.voxel_volume
-        whole = solid if solid > (1 + _ROUNDED) * inside else inside
+    whole = float(region.sum()) + beyond
     reasons = {
-        "lies beyond the volume": 1 - inside / whole,
+        "lies beyond the volume": beyond / whole,
         "is not seen from all sides": float((region.bool() & ~seen).sum()) / whole,
         "is metal or too near to it": float((region.bool() & seen & ~apart).sum()) / whole,
     }
     if stated := [f"{100 * share:.0f} % {reason}" for reason, share in reasons.items() if share >= _NOTICEABLE]:
-        warnings.warn(f"{name}: {', '.join(stated)} and is left out", stacklevel=3)
+        warnings.warn(f"{content.name}: {', '.join(stated)} and is left out", stacklevel=3)
     return 1 - content.num_voxels / whole
 
 

@@ -234,6 +234,19 @@ class ImplantPointCloud(nn.Module):
         """Edge of a cube with the volume of a cell, mm."""
         return torch.linalg.det(self.cell.double()).abs().item() ** (1 / 3)
 
+    @property
+    def filled(self) -> Tensor:
+        """Share of its cell that the metal of each node fills, (N,), float64."""
+        return self.volumes.double() / torch.linalg.det(self.cell.double()).abs()
+
+    def in_cells(self) -> Tensor:
+        """Positions of the nodes on their lattice, (N, 3), float64: whole numbers are the middles of cells.
+
+        They are counted from the node with the most metal, whose cell is full, so that its node is its middle.
+        """
+        points = self.points.double()
+        return (points - points[self.filled.argmax()]) @ torch.linalg.inv(self.cell.double())
+
     def gyration(self, pitch_mm: float = 1.0) -> tuple[Tensor, Tensor]:
         """Centre of mass (3,) and radius of gyration, mm, float64, of nodes merged to a pitch of `pitch_mm`."""
         coarse = self.coarsened_to(pitch_mm)

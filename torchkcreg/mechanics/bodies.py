@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -28,11 +27,8 @@ def body_volumes(cloud: ImplantPointCloud) -> list[float]:
     >>> [round(volume) for volume in body_volumes(ImplantPointCloud.from_mesh(pair, 0.5))]
     [240, 192]
     """
-    points, volumes = cloud.points.detach().double().cpu(), cloud.volumes.detach().double().cpu()
-    cell = cloud.cell.detach().double().cpu()
-    filled = (volumes / torch.linalg.det(cell).abs()).numpy()
-    in_cells = (points - points[int(filled.argmax())]) @ torch.linalg.inv(cell)
-    index = in_cells.round().long().numpy()
+    filled = cloud.filled.detach().cpu().numpy()
+    index = cloud.in_cells().detach().cpu().round().long().numpy()
     index -= index.min(0) - 2
     shape = tuple(index.max(0) + 3)
     number = np.full(shape, -1)
@@ -46,7 +42,8 @@ def body_volumes(cloud: ImplantPointCloud) -> list[float]:
         pairs.append(np.stack([along[:-1][both], along[1:][both]]))
     rows, columns = np.concatenate(pairs, axis=1)
     graph = coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(index), len(index)))
-    sizes = np.bincount(connected_components(graph, directed=False)[1], weights=volumes.numpy())
+    volumes = cloud.volumes.detach().double().cpu().numpy()
+    sizes = np.bincount(connected_components(graph, directed=False)[1], weights=volumes)
     return sorted((float(size) for size in sizes if size > _CRUMB * sizes.sum()), reverse=True)
 
 

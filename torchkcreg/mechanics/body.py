@@ -64,8 +64,8 @@ class ElasticBody:
             self._factor = cholesky_banded(_banded(self.stiffness, self._pinned), lower=True, overwrite_ab=True)
         except LinAlgError:
             raise ValueError(
-                "the implant's stiffness is singular: parts of it hang together too loosely for its finite elements; "
-                "bend it with --deformation modes"
+                "the implant's stiffness matrix is singular, because some of its parts are hardly connected: bend it "
+                "with --deformation modes"
             ) from None
 
     def nodal_loads(self, points: Tensor, forces: Tensor) -> Tensor:

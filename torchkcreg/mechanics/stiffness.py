@@ -74,14 +74,14 @@ def _boxes(hexahedra: Hexahedra, cloud: ImplantPointCloud) -> tuple[Tensor, Tens
     There is one for each node, or several where its cell reaches into several cubes. A node at the surface has the box
     between the cell's far sides whose middle is the node, scaled to its volume.
     """
-    points, volumes, cell = cloud.points.double(), cloud.volumes.double(), cloud.cell.double()
-    filled = volumes / torch.linalg.det(cell).abs()
-    in_cells = (points - points[filled.argmax()]) @ torch.linalg.inv(cell)  # that cell is full: its node is its middle
+    in_cells, volumes = cloud.in_cells(), cloud.volumes.double()
     extents = (1 - 2 * (in_cells - in_cells.round()).abs()).clamp_min(_THINNEST)
-    extents = extents * (filled / extents.prod(1))[:, None] ** (1 / 3)
-    along = (cell @ hexahedra.frame[:3, :3]).square()  # squared edges in the lattice's axes: second moments add
+    extents = extents * (cloud.filled / extents.prod(1))[:, None] ** (1 / 3)
+    along = (
+        cloud.cell.double() @ hexahedra.frame[:3, :3]
+    ).square()  # squared edges in the lattice's axes: second moments add
     halves = (extents.square() @ along).sqrt() / 2
-    centers = transform_points(invert_rigid(hexahedra.frame), points)
+    centers = transform_points(invert_rigid(hexahedra.frame), cloud.points.double())
     for axis in range(3):
         low, high = centers[:, axis] - halves[:, axis], centers[:, axis] + halves[:, axis]
         face = ((low / hexahedra.edge).floor() + 1) * hexahedra.edge

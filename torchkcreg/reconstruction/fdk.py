@@ -17,7 +17,7 @@ from torchkcreg.projector import backproject_weighted
 
 from .axial_frame import axial_frame, columns_and_rows, is_aligned, rectified
 from .field_of_view import coverage, height_shares, views_by_source
-from .redundancy import AngularSampling, angular_sampling, line_weights, unmeasured
+from .redundancy import LineCoverage, angular_sampling
 from .scan_views import ViewShard
 
 WINDOWS = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")
@@ -153,7 +153,7 @@ def fdk(
     and the redundancy weight, ramp-filtered along p. The positions p and zeta are in mm on the virtual detector through
     the axis of rotation, and R is the source-to-axis distance. Views may be in any order and at any angles around the
     world's z axis, over a full turn or less, with gaps, of centred or offset detectors: lines measured twice share
-    their weight (`line_weights`). If more than 0.2 % of the lines at some distance from the axis were never measured,
+    their weight (`LineCoverage`). If more than 0.2 % of the lines at some distance from the axis were never measured,
     there is a warning. Tilted detectors are resampled first.
 
     With several focal spots (`geometry.sources`) a volume is reconstructed for each; it is exact in the plane of the
@@ -255,27 +255,28 @@ def _plan(geometry: ConeBeamGeometry, grid: VolumeGrid) -> _Plan:
     columns, rows = columns_and_rows(frame, geometry.det_shape)
     radii = frame.radii[:, None]
     sampling, fans = angular_sampling(frame.angles.cpu()), (columns / radii).atan().cpu()
-    _check_coverage(sampling, fans, float(frame.radii.mean()), grid)
+    lines = LineCoverage(sampling, fans)
+    _check_coverage(lines, float(frame.radii.mean()), grid)
     # the short side of an offset detector: filtered signal beyond it contributes
     first, last = -float(columns[0, 0]), float(columns[0, -1])
     missing = round((last - first) / float(columns[0, 1] - columns[0, 0]))
     beyond = (max(missing, 0), max(-missing, 0))
-    weights = (line_weights(sampling, fans) * sampling.steps[:, None]).to(columns) * radii**2
+    weights = (lines.weights() * sampling.steps[:, None]).to(columns) * radii**2
     matrices = geometry.projection_matrices.clone()
     matrices[:, 0] += beyond[0] * matrices[:, 2]
     return _Plan(frame.radii, columns, rows, weights, matrices, beyond)
 
 
-def _check_coverage(sampling: AngularSampling, fans: Tensor, radius: float, grid: VolumeGrid) -> None:
+def _check_coverage(lines: LineCoverage, radius: float, grid: VolumeGrid) -> None:
     """Warn or refuse if lines through the grid were never measured."""
     ends = [torch.tensor([0.0, n - 1], dtype=torch.float64) for n in reversed(grid.shape)]
     corners = transform_points(grid.voxel_to_world.double(), torch.cartesian_prod(*ends))
     reach = float(corners[:, :2].abs().amax())  # of the circle in the grid: scans rarely see its corners
     widest = math.asin(min(1.0, reach / radius))
-    missing, fan = unmeasured(sampling, fans, widest)
+    missing, fan = lines.unmeasured(widest)
     text = (
         f"no view measures {100 * missing:.1f} % of the lines at {radius * math.sin(fan):.0f} mm from the axis of "
-        f"rotation: the views cover {sampling.covered_deg:.0f} degrees"
+        f"rotation: the views cover {lines.sampling.covered_deg:.0f} degrees"
     )
     if missing > UNMEASURED:
         raise ValueError(f"{text}; FDK needs 180 degrees plus the fan angle, or a full turn with an offset detector")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid
+from torchkcreg.geometry import ConeBeamGeometry, VolumeGrid, transform_points
 
 COARSE_MM = 8.0  # coverage is smooth: it is computed on nodes about this far apart
 RIM_PX = 8.0  # width of the border over which coverage falls to zero
@@ -18,19 +18,13 @@ SPREAD_MM = 10.0  # focal spots whose mean heights differ by less are treated as
 
 def coverage(geometry: ConeBeamGeometry, grid: VolumeGrid) -> Tensor:
     """Fraction of the views that see each voxel, (D, H, W), float32; a view near its border counts in part."""
-    steps = [max(1, round(COARSE_MM / d)) for d in reversed(grid.spacing)]
-    shape = tuple(max(2 if n > 1 else 1, -(-n // step) + 1) for n, step in zip(grid.shape, steps))
-    positions = [torch.linspace(0, n - 1, count, dtype=torch.float64) for n, count in zip(grid.shape, shape)]
-    k, j, i = torch.meshgrid(*positions, indexing="ij")
-    matrix = grid.voxel_to_world
-    points = torch.stack([i, j, k], dim=-1).reshape(-1, 3) @ matrix[:3, :3].mT + matrix[:3, 3]
-    uv, depth = geometry.project(points.to(geometry.projection_matrices.device))
+    points = _coarse_points(grid, COARSE_MM)
+    uv, depth = geometry.project(points.reshape(-1, 3).to(geometry.projection_matrices.device))
     rows, cols = geometry.det_shape
     inward = torch.minimum(uv + 0.5, uv.new_tensor([cols - 0.5, rows - 0.5]) - uv)  # (V, N, 2)
     rim = inward.new_tensor([max(1.0, min(RIM_PX, n / 4)) for n in (cols, rows)])
     inside = ((inward / rim).clamp(0, 1).amin(-1) * (depth > 0)).mean(0)
-    coarse = inside.reshape(1, 1, *shape).float()
-    return interpolate(coarse, size=tuple(grid.shape), mode="trilinear", align_corners=True)[0, 0]
+    return _interpolated(inside.reshape(points.shape[:3]).float(), grid)
 
 
 def seen_from_all_sides(geometry: ConeBeamGeometry, grid: VolumeGrid) -> Tensor:
@@ -39,25 +33,32 @@ def seen_from_all_sides(geometry: ConeBeamGeometry, grid: VolumeGrid) -> Tensor:
     A voxel beyond the fan of a full turn is not, nor one that a short scan sees from too few sides; one that a half-fan
     turn sees in half of its views is.
     """
-    steps = [max(1, round(COARSE_MM / 2 / d)) for d in reversed(grid.spacing)]
-    picks = [torch.linspace(0, n - 1, -(-n // step) + 1).round().long().unique() for n, step in zip(grid.shape, steps)]
-    k, j, i = torch.meshgrid(*picks, indexing="ij")
-    matrix = grid.voxel_to_world
-    points = torch.stack([i, j, k], dim=-1).reshape(-1, 3).double() @ matrix[:3, :3].mT + matrix[:3, 3]
+    points = _coarse_points(grid, COARSE_MM / 2).to(geometry.projection_matrices.device)
+    flat = points.reshape(-1, 3)
     sectors = max(4, min(MOST_SECTORS, geometry.num_views // 4))
-    hit = torch.zeros(len(points), sectors, dtype=torch.bool)
+    hit = torch.zeros(len(flat), sectors, dtype=torch.bool, device=flat.device)
     rows, cols = geometry.det_shape
-    limits = torch.tensor([cols - 0.5, rows - 0.5], dtype=torch.float64)
-    for view in range(geometry.num_views):
-        one = geometry.select([view])
-        uv, depth = (x[0].cpu() for x in one.project(points.to(geometry.projection_matrices.device)))
-        inside = ((uv >= -0.5) & (uv <= limits)).all(-1) & (depth > 0)
-        along = points[:, :2] - one.source_positions[0, :2].cpu()
-        sector = ((torch.atan2(along[:, 1], along[:, 0]) % math.pi) / math.pi * sectors).long().clamp(max=sectors - 1)
+    for view, source in enumerate(geometry.source_positions):  # one at a time: all would take gigabytes
+        uv, depth = (values[0] for values in geometry.select([view]).project(flat))
+        inside = ((uv >= -0.5) & (uv <= uv.new_tensor([cols - 0.5, rows - 0.5]))).all(-1) & (depth > 0)
+        x, y = (flat[:, :2] - source[:2]).unbind(-1)
+        sector = (torch.atan2(y, x) % math.pi / math.pi * sectors).long().clamp(max=sectors - 1)
         hit[inside, sector[inside]] = True
-    complete = hit.double().mean(1).reshape(1, 1, *k.shape)
-    whole = interpolate(complete, size=tuple(grid.shape), mode="trilinear", align_corners=True)[0, 0]
-    return whole >= COMPLETE
+    return _interpolated(hit.float().mean(1).reshape(points.shape[:3]), grid) >= COMPLETE
+
+
+def _coarse_points(grid: VolumeGrid, apart_mm: float) -> Tensor:
+    """Nodes (d, h, w, 3) about `apart_mm` apart from the first to the last voxel of a grid, float64, in the world."""
+    steps = [max(1, round(apart_mm / d)) for d in reversed(grid.spacing)]
+    counts = [max(2 if n > 1 else 1, -(-n // step) + 1) for n, step in zip(grid.shape, steps)]
+    positions = [torch.linspace(0, n - 1, count, dtype=torch.float64) for n, count in zip(grid.shape, counts)]
+    k, j, i = torch.meshgrid(*positions, indexing="ij")
+    return transform_points(grid.voxel_to_world, torch.stack([i, j, k], dim=-1))
+
+
+def _interpolated(coarse: Tensor, grid: VolumeGrid) -> Tensor:
+    """Values (D, H, W) at the voxels from those at the nodes of `_coarse_points`."""
+    return interpolate(coarse[None, None], size=tuple(grid.shape), mode="trilinear", align_corners=True)[0, 0]
 
 
 def field_of_view_grid(geometry: ConeBeamGeometry, spacing: float) -> VolumeGrid:

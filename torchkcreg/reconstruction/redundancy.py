@@ -76,9 +76,9 @@ def angular_sampling(angles: Tensor) -> AngularSampling:
     after = turned[order].roll(-1) - turned[order]  # from each view to the next
     after[-1] += 2 * math.pi
     apart = after[after > 1e-9]
-    ends = after > _GAP * apart.quantile(0.9, interpolation="lower")
-    if bool(ends.any()):
-        after[ends] = apart[apart <= _GAP * apart.quantile(0.9, interpolation="lower")].median()
+    widest = _GAP * apart.quantile(0.9, interpolation="lower")
+    ends = after > widest
+    after[ends] = apart[apart <= widest].median()
     before = after.roll(1)
     steps = torch.empty_like(turned)
     steps[order] = (before + after) / 2
@@ -122,56 +122,53 @@ class Fans:
         return torch.where(inside, risen, torch.zeros_like(risen))
 
 
-def line_weights(sampling: AngularSampling, fan_angles: Tensor) -> Tensor:
-    """Weights (V, cols) of the rays of a scan: the measurements of a line add up to one line.
-
-    Where some of the lines at a distance from the axis were never measured, the others are weighted up for them, so
-    that levels stay right; see `unmeasured`.
+class LineCoverage:
+    """How often each line of a scan was measured: weights of its rays, and lines that no ray measures.
 
     Args:
         sampling: Angles of the views.
         fan_angles: (V, cols), radians, positive towards increasing gantry angle.
 
     >>> turn = angular_sampling(torch.arange(0.0, 360.0).deg2rad())
-    >>> line_weights(turn, torch.linspace(-0.2, 0.2, 3).expand(360, 3))[0].tolist()
+    >>> LineCoverage(turn, torch.linspace(-0.2, 0.2, 3).expand(360, 3)).weights()[0].tolist()
     [0.5, 0.5, 0.5]
     """
-    fans = Fans.of(fan_angles)
-    grid, measured = _measured(sampling, fans)
-    weights = _weights(sampling, fans, fan_angles)
-    return weights / _interpolated(measured.clamp_min(1e-3), grid, fan_angles.abs())
 
+    def __init__(self, sampling: AngularSampling, fan_angles: Tensor) -> None:
+        self.sampling, self.fan_angles, self.fans = sampling, fan_angles, Fans.of(fan_angles)
+        widest = float(torch.maximum(-self.fans.low, self.fans.high).median())
+        self._grid = torch.linspace(0, widest, _FANS, dtype=torch.float64) * (1 - 1e-9)
+        both = [self.shares((side * self._grid).expand(len(fan_angles), _FANS)) for side in (1, -1)]
+        self._measured = (sampling.steps[:, None] * (both[0] + both[1])).sum(0) / (2 * math.pi)
 
-def unmeasured(sampling: AngularSampling, fan_angles: Tensor, widest: float) -> tuple[float, float]:
-    """Largest share of the lines at one distance from the axis that no ray measures, and its fan angle in radians.
+    def weights(self) -> Tensor:
+        """Weights (V, cols) of the rays: the measurements of a line add up to one line.
 
-    Args:
-        sampling: Angles of the views.
-        fan_angles: (V, cols), radians.
-        widest: Lines at larger fan angles do not count: they miss the volume.
-    """
-    grid, measured = _measured(sampling, Fans.of(fan_angles))
-    missing = (1 - measured)[grid <= max(widest, float(grid[1]))]
-    worst = int(missing.argmax())
-    return float(missing[worst]), float(grid[worst])
+        Where some of the lines at a distance from the axis were never measured, the others are weighted up for them, so
+        that levels stay right.
+        """
+        measured = _interpolated(self._measured.clamp_min(1e-3), self._grid, self.fan_angles.abs())
+        return self.shares(self.fan_angles) / measured
 
+    def unmeasured(self, widest: float) -> tuple[float, float]:
+        """Largest share of the lines at one distance from the axis that no ray measures, and its fan angle in radians.
 
-def _weights(sampling: AngularSampling, fans: Fans, fan_angles: Tensor) -> Tensor:
-    """Weights (V, n) of rays at fan angles (V, n), 0 beyond the detector."""
-    views = torch.arange(len(fan_angles))[:, None].expand(fan_angles.shape)
-    angles = sampling.angles.to(fan_angles)[:, None]
-    here = sampling.confidence(angles) * fans.confidence(views, fan_angles)
-    opposite = (angles + math.pi - 2 * fan_angles) % (2 * math.pi)
-    there = sampling.confidence(opposite) * fans.confidence(_nearest(sampling.angles, opposite), -fan_angles)
-    return here / (here + there).clamp_min(torch.finfo(here.dtype).tiny)
+        Args:
+            widest: Lines at larger fan angles do not count: they miss the volume.
+        """
+        missing = (1 - self._measured)[self._grid <= max(widest, float(self._grid[1]))]
+        worst = int(missing.argmax())
+        return float(missing[worst]), float(self._grid[worst])
 
-
-def _measured(sampling: AngularSampling, fans: Fans) -> tuple[Tensor, Tensor]:
-    """Fan angles from 0 to the widest, and the share of the lines at each that was measured."""
-    widest = float(torch.maximum(-fans.low, fans.high).median())
-    grid = torch.linspace(0, widest, _FANS, dtype=torch.float64) * (1 - 1e-9)
-    both = [_weights(sampling, fans, (side * grid).expand(len(fans.low), _FANS)) for side in (1, -1)]
-    return grid, (sampling.steps[:, None] * (both[0] + both[1])).sum(0) / (2 * math.pi)
+    def shares(self, fan_angles: Tensor) -> Tensor:
+        """Share (V, n) in its line of each ray at fan angles (V, n) of the views, 0 beyond the detector."""
+        views = torch.arange(len(fan_angles))[:, None].expand(fan_angles.shape)
+        angles = self.sampling.angles.to(fan_angles)[:, None]
+        here = self.sampling.confidence(angles) * self.fans.confidence(views, fan_angles)
+        opposite = (angles + math.pi - 2 * fan_angles) % (2 * math.pi)
+        twins = _nearest(self.sampling.angles, opposite)
+        there = self.sampling.confidence(opposite) * self.fans.confidence(twins, -fan_angles)
+        return here / (here + there).clamp_min(torch.finfo(here.dtype).tiny)
 
 
 def _nearest(angles: Tensor, asked: Tensor) -> Tensor:

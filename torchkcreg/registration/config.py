@@ -112,7 +112,6 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
 
     If the deformation is "ffd", groups move freely in all stages.
     """
-    finest = {"groups": 10} if deformation == "ffd" else {"groups": 20, "modes": 40}
     start = Stage(
         bin=16,
         pitch_factor=8,
@@ -127,6 +126,9 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
         before=("find_screws",),
         after=("slide",),
     )
+    if preset == "paper":
+        return _paper_stages(start)
+    finest = {"groups": 10} if deformation == "ffd" else {"groups": 20, "modes": 40}
     parts, every = ("screws", "tilts"), ("screws", "tilts", *PHYSICS)
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
     fine = {"estimate": every, **seen}
@@ -142,8 +144,6 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
         Stage(**finest, bin=2, before=after_others, **fine),
         Stage(**finest, bin=1, before=("align", *after_others, *weighed), **(fine | {"estimate": (*every, "views")})),
     ]
-    if preset == "paper":
-        return _paper_stages(start)
     if preset == "adam":
         steps = (0.2, 0.1, 0.05, 0.05, 0.02, 0.02)
         descend = {"optimizer": "adam", "iterations": 120}

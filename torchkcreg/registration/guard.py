@@ -21,7 +21,6 @@ _NEGLIGIBLE = 0.01  # of the images
 _MARGIN_MM = 12.0
 _LARGEST_STRAIN = 0.02  # root mean square; metal yields at a tenth of it
 _LARGEST_TURN_DEG = 60.0
-NOT_FINITE = "its parameters are not finite"
 _FURTHEST = 1.5  # lengths of the implant
 
 
@@ -60,18 +59,24 @@ class Guard:
 
         Without `undo_stages` only a stage that ends in numbers that are not finite is undone.
         """
+        if not _is_finite(self.scene):
+            self.scene.restore(self.kept)
+            return "its parameters are not finite"
         reason = implausible(self.scene, self.first_poses)
-        if reason is not None and reason != NOT_FINITE and not self.config.undo_stages:
-            return None
-        if reason is None:
-            now = misfit(self.scene, self.data, self.config, self.bin)
-            bearable = now <= _LOST * self.misfit + _NEGLIGIBLE or not self.config.undo_stages
-            if bearable or (math.isfinite(now) and not math.isfinite(self.misfit)):
-                self.misfit = now
-                return None
+        now = misfit(self.scene, self.data, self.config, self.bin) if reason is None else math.nan
+        kept = now <= _LOST * self.misfit + _NEGLIGIBLE or (math.isfinite(now) and not math.isfinite(self.misfit))
+        if reason is None and not kept:
             reason = f"it left {100 * now:.1f} % of the images unexplained, {100 * self.misfit:.1f} % before"
+        if reason is None or not self.config.undo_stages:
+            self.misfit = now
+            return None
         self.scene.restore(self.kept)
         return reason
+
+
+def _is_finite(scene: Scene) -> bool:
+    values = [*scene.parameters(), *(assembly.implant_to_world for assembly in scene)]
+    return all(bool(torch.isfinite(value).all()) for value in values)
 
 
 @torch.no_grad()
@@ -91,9 +96,6 @@ def misfit(scene: Scene, data: RegistrationData, config: RegistrationConfig, bin
 @torch.no_grad()
 def implausible(scene: Scene, starts: list[Tensor]) -> str | None:
     """Reason why the scene is implausible for implants that started at poses (4, 4); None if plausible."""
-    values = [*scene.parameters(), *(a.implant_to_world for a in scene)]
-    if not all(bool(torch.isfinite(value).all()) for value in values):
-        return NOT_FINITE
     for assembly, start in zip(scene, starts, strict=True):
         points = assembly.implant.points.double()
         moved = transform_points(assembly.implant_to_world, points) - transform_points(start, points)

@@ -115,12 +115,12 @@ def converted(
 
 def _check_undivided(image: NDArray, beam: NDArray) -> None:
     """Raise ValueError if intensities were divided by the open beam already."""
-    if image.dtype.kind != "f":
+    if image.dtype.kind != "f" or np.median(beam) < COUNTED:
         return
-    values = image[np.isfinite(image)]
-    if values.size and 0 < values.max() <= DIVIDED and np.median(beam) >= COUNTED:
+    largest = np.max(image, where=np.isfinite(image), initial=0.0)
+    if 0 < largest <= DIVIDED:
         raise ValueError(
-            f"intensities of at most {values.max():.3g} beside an open beam of {np.median(beam):.4g} were divided "
+            f"intensities of at most {largest:.3g} beside an open beam of {np.median(beam):.4g} were divided "
             "already: give an open beam of 1 (--open-beam 1)"
         )
 
@@ -130,7 +130,7 @@ def _compare_beams(given: NDArray, stored: NDArray) -> None:
     levels = [float(np.median(beam)) for beam in (given, stored) if beam.dtype.kind in "uif" and beam.size]
     if len(levels) == 2 and abs(levels[0] - levels[1]) > OTHER_BEAM * abs(levels[1]):
         warnings.warn(
-            f"the file says an open beam of {levels[1]:.4g}, the one that was given is {levels[0]:.4g}: it is used",
+            f"the file says an open beam of {levels[1]:.4g}, but {levels[0]:.4g} was given: that one is used",
             stacklevel=4,
         )
 

@@ -25,17 +25,18 @@ def in_order(files: Iterable[Path]) -> list[Path]:
     >>> [path.name for path in in_order([Path("v10.tif"), Path("v2.tif"), Path("v-1.tif")])]
     ['v-1.tif', 'v2.tif', 'v10.tif']
     """
-    listed = list(files)
-    stems = {file: _stem(file) for file in listed}
+    stems = {file: _stem(file) for file in files}
     bare = {_DIGITS.sub("#", stem) for stem in stems.values()}
-
-    def key(file: Path, *, decimal: bool) -> list[tuple[float, str]]:
-        pattern = _DECIMAL if decimal else _SIGNED
-        return [_part(text, stems[file], start, bare) for text, start in _parts(pattern, stems[file])]
-
-    order = sorted(listed, key=lambda file: key(file, decimal=True))
-    has_minus = any(-math.inf < value < 0 for file in listed for value, _ in key(file, decimal=True))
-    if not has_minus and order != sorted(listed, key=lambda file: key(file, decimal=False)):
+    decimal, separate = (
+        {
+            file: [_part(text, stem, start, bare) for text, start in _parts(pattern, stem)]
+            for file, stem in stems.items()
+        }
+        for pattern in (_DECIMAL, _SIGNED)
+    )
+    order = sorted(stems, key=decimal.__getitem__)
+    has_minus = any(-math.inf < value < 0 for parts in decimal.values() for value, _ in parts)
+    if not has_minus and order != sorted(stems, key=separate.__getitem__):
         shown = ", ".join(file.name for file in order[:4])
         warnings.warn(f"points in the names of the views are read as decimal points: {shown}, ...", stacklevel=2)
     return order
