@@ -36,5 +36,8 @@ class Config(BaseModel):
         try:
             return cls.model_validate(dict(options))
         except ValidationError as error:
-            problems = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+            problems = [
+                ": ".join(filter(None, (".".join(map(str, e["loc"])), e["msg"].removeprefix("Value error, "))))
+                for e in error.errors()
+            ]
             raise ValueError(f"{source}: {'; '.join(problems)}") from None

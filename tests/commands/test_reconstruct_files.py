@@ -68,7 +68,8 @@ def arguments(folder, out, *more):
 
 @pytest.mark.parametrize("method", ["fdk", "pwls"])
 def test_the_command_line_makes_a_volume_with_its_geometry(ball_scan, tmp_path, method):
-    assert main(arguments(ball_scan, tmp_path / "out", "--method", method, "--iterations", 6, "--beta", 1)) == 0
+    of_method = {"fdk": [], "pwls": ["--iterations", 6, "--beta", 1]}[method]
+    assert main(arguments(ball_scan, tmp_path / "out", "--method", method, *of_method)) == 0
     volume, grid = read_volume(tmp_path / "out" / "volume.mha")
     inside = grid.points().norm(dim=-1) < 14
     assert volume[inside].mean() == pytest.approx(0.02, rel=0.03)
@@ -229,8 +230,26 @@ def test_wrong_input_is_one_line_that_names_it(ball_scan, small_run, tmp_path, c
     assert "size_mm must be positive" in capsys.readouterr().err
     assert main(["reconstruct", "--out", str(tmp_path / "d")]) == 2
     assert "needs geometry and projections" in capsys.readouterr().err
+    assert main(arguments(ball_scan, tmp_path / "e", "--initial", ball_scan / "geometry.json")) == 2
+    assert "an initial volume has no effect on fdk" in capsys.readouterr().err
     with pytest.raises(ValueError, match="unknown_key: Extra inputs"):
         resolve_options({"unknown_key": 1})
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("fdk", {"iterations": 10, "beta": 3.0}, "no effect on fdk, only on pwls, kcrec: iterations, beta"),
+        ("pwls", {"window": "cosine"}, "no effect on pwls, only on fdk, kcmar: window"),
+        ("pwls", {"material": "steel"}, "no effect on pwls, only on kcmar, kcrec: material"),
+        ("fdk", {"center_mm": (1.0, 0.0, 0.0)}, "center_mm has no effect without size_mm"),
+    ],
+)
+def test_an_option_without_effect_on_the_method_is_refused(method: str, options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        resolve_options({"method": method, **options})
+    defaults = {name: ReconstructionOptions.model_fields[name].default for name in options}
+    assert resolve_options({"method": method, **defaults}).method == method
 
 
 def test_known_components_take_two_passes_unless_told_otherwise() -> None:

@@ -248,6 +248,24 @@ def test_dicom_files_without_endings_or_numbers_are_in_the_order_of_their_names(
             read(tmp_path)
 
 
+def test_two_dicom_series_in_a_folder_are_refused_and_single_exposures_are_views(tmp_path):
+    for index, series in enumerate(("1.2", "1.2", "1.3")):
+        dicom(tmp_path / f"{index}.dcm", RAW[index], **XA, InstanceNumber=index, SeriesInstanceUID=series)
+    with pytest.raises(ValueError, match="belong to 2 series"):
+        read_projections(tmp_path, open_beam=4000)
+    (tmp_path / "0.dcm").unlink()
+    assert len(lines_of(tmp_path, open_beam=4000)) == 2
+
+
+def test_a_link_within_the_folder_may_lead_to_data_elsewhere(tmp_path):
+    (tmp_path / "store").mkdir()
+    np.save(tmp_path / "store" / "views.npy", RAW)
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "scan" / "views.npy").symlink_to(tmp_path / "store" / "views.npy")
+    (tmp_path / "scan" / "scan.yaml").write_text("images: views.npy\nopen_beam: 4000\n")
+    assert lines_of(tmp_path / "scan" / "scan.yaml").shape == RAW.shape
+
+
 def test_each_dicom_file_has_distances_of_its_own_and_pixels_of_one_size(tmp_path):
     for index, sdd in enumerate((1200, 1300)):
         dicom(tmp_path / f"{index}.dcm", RAW[index], **{**XA, "DistanceSourceToDetector": sdd})

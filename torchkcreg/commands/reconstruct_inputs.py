@@ -168,6 +168,8 @@ def read_reconstruction_inputs(files: ReconstructionFiles, options: Reconstructi
         raise ValueError("soft tissue fixes the scale of an estimated beam: it needs beam estimate")
     if options.beam != "given" and options.monoenergetic:
         raise ValueError(f"monoenergetic cannot be combined with beam {options.beam}: leave one of the two out")
+    if options.is_filtered and files.initial is not None:
+        raise ValueError(f"an initial volume has no effect on {options.method}: use method pwls or kcrec")
     spectrum = read_spectrum(files.spectrum) if files.spectrum is not None else None
     if options.single_material is not None:
         material(options.single_material)

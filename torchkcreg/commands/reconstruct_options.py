@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from torchkcreg.options import Config
 
@@ -32,6 +32,13 @@ class ReconstructionFiles:
     components: Path | None = None
     open_beam: float | None = None
     initial: Path | None = None
+
+
+_ONLY_FOR = {
+    ("window",): ("fdk", "kcmar"),
+    ("preset", "iterations", "subsets", "beta", "passes"): ("pwls", "kcrec"),
+    ("material", "soft_tissue"): ("kcmar", "kcrec"),
+}
 
 
 class ReconstructionOptions(Config):
@@ -90,6 +97,18 @@ class ReconstructionOptions(Config):
     material: str | None = None
     single_material: str | None = None
     backend: Literal["auto", "cpp", "torch"] = "auto"
+
+    @model_validator(mode="after")
+    def _options_fit_the_method(self) -> ReconstructionOptions:
+        for names, methods in _ONLY_FOR.items():
+            if self.method in methods:
+                continue
+            idle = [name for name in names if getattr(self, name) != type(self).model_fields[name].default]
+            if idle:
+                raise ValueError(f"no effect on {self.method}, only on {', '.join(methods)}: {', '.join(idle)}")
+        if self.center_mm != (0.0, 0.0, 0.0) and self.size_mm is None:
+            raise ValueError("center_mm has no effect without size_mm: the volume is the whole field of view")
+        return self
 
     @property
     def is_filtered(self) -> bool:

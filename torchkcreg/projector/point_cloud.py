@@ -53,7 +53,8 @@ def project_points(
         Path lengths in mm, shape (..., V, rows, cols), bitwise the same for any number of threads.
 
     Raises:
-        ValueError: Shapes, dtypes or devices do not fit, or the backend does not exist.
+        ValueError: Shapes, dtypes or devices do not fit, the backend does not exist, or (checked with `cell`) all nodes
+            lie behind the source of a view, as with a matrix of the wrong sign.
         OSError: With `backend="cpp"`, if the C++ kernels are not available.
 
     >>> P = torch.tensor([[[1000.0, 0, 32, 16000], [0, 1000, 32, 16000], [0, 0, 1, 500]]])  # 1000 px of focal length
@@ -66,6 +67,7 @@ def project_points(
     _check_points(points, volumes, projection_matrices, det_shape)
     choose_backend(points, backend, operator=POINT_DRR.name)  # rejects a wrong name before the footprint is computed
     if footprint is None and cell is not None:
+        _check_front(points, projection_matrices)
         footprint = cell_footprint(points, cell, projection_matrices)
     elif footprint is None or cell is not None:
         raise ValueError("give either cell or footprint")
@@ -121,6 +123,17 @@ def _check_points(points: Tensor, volumes: Tensor, matrices: Tensor, det_shape: 
             raise ValueError(f"{name} must be on the points' device {points.device}, got {tensor.device}")
     if len(det_shape) != 2 or min(det_shape) < 1:
         raise ValueError(f"det_shape must be (rows, cols), both positive, got {tuple(det_shape)}")
+
+
+def _check_front(points: Tensor, matrices: Tensor) -> None:
+    """Raise ValueError if all nodes lie behind the source of a view."""
+    front = matrices[:, 2].to(points.dtype).detach()
+    behind = (points.detach() @ front[:, :3].mT + front[:, 3] <= 0).flatten(0, -2).all(0)
+    if bool(behind.any()):
+        raise ValueError(
+            f"all points lie behind the source of view {int(behind.nonzero()[0])}: its projection matrix may have the "
+            "wrong sign (a ConeBeamGeometry sets it)"
+        )
 
 
 def _check_footprint(footprint: Footprint, points: Tensor, matrices: Tensor) -> None:

@@ -90,6 +90,8 @@ def _failures(diagnostics: Diagnostics) -> list[str]:
             f"the implant is not where the images show metal: gradient correlation is {weakest:.2f} in view "
             f"{diagnostics.gc.index(weakest)}, no more than with images of something else (up to {_UNRELATED:g})"
         )
+    if weakest < -_UNRELATED:
+        reasons.append("the images are brighter behind metal where they should be darker: they may be inverted")
     if not diagnostics.misfit <= _NOTHING and not diagnostics.node_std_mm <= _ANYWHERE_MM:
         reasons.append(
             f"{100 * diagnostics.misfit:.0f} % of the images' contrast is left unexplained and the nodes are expected "

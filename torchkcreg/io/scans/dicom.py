@@ -33,7 +33,7 @@ def dicom_files(folder: Path) -> list[Path]:
     """DICOM files of a folder, sorted by instance number, or by the numbers in their names if it is missing.
 
     Raises:
-        ValueError: Some instance numbers are missing or equal, but not all.
+        ValueError: Some instance numbers are missing or equal, but not all, or the files belong to several series.
     """
     return list(_ordered(folder))
 
@@ -41,6 +41,9 @@ def dicom_files(folder: Path) -> list[Path]:
 def _ordered(folder: Path) -> dict[Path, Any]:
     """DICOM files of a folder in order, with their tags."""
     tags = {file: _tags(file) for file in in_order(filter(is_dicom, folder.iterdir()))}
+    series = {_text(dataset, "SeriesInstanceUID") for dataset in tags.values()}
+    if 1 < len(series) < len(tags):  # a series for each file: single exposures
+        raise ValueError(f"its DICOM files belong to {len(series)} series: keep the files of one series in a folder")
     numbers = {file: _number(dataset, "InstanceNumber", 0) for file, dataset in tags.items()}
     if 1 < len(set(numbers.values())) < len(numbers):
         raise ValueError("its DICOM files do not say their order: InstanceNumber is missing or the same in some")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -111,8 +112,9 @@ def read_description(path: Path) -> ScanDescription:
 
 def _place(path: Path, name: Path) -> Path:
     """The path of a file or folder named in the description at `path`."""
-    folder, place = path.parent, path.parent / name
-    if not place.resolve().is_relative_to(folder.resolve()):
+    place = path.parent / name
+    # A link within the folder may lead to data elsewhere.
+    if name.is_absolute() or os.path.normpath(name).startswith(".."):
         raise ValueError(
             f"{name} lies outside the description's folder: paths are relative to it and must lie within it"
         )
