@@ -20,9 +20,9 @@ from pathlib import Path
 
 PARTS = {
     "similarity": ("torchkcreg/similarity", "tests/similarity"),
-    "splines": ("torchkcreg/splines", "tests/splines tests/deformation/test_ffd.py"),
+    "splines": ("torchkcreg/splines", "tests/splines tests/deformation/test_ffd.py tests/test_derivatives.py"),
     "deformation": ("torchkcreg/deformation", "tests/deformation"),
-    "projector": ("torchkcreg/projector", "tests/projector"),
+    "projector": ("torchkcreg/projector", "tests/projector tests/test_derivatives.py"),
     "fdk": (
         "torchkcreg/reconstruction/fdk.py",
         "tests/reconstruction/test_fdk.py tests/reconstruction/test_redundancy.py",
@@ -43,6 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder of the clone and of the results")
     parser.add_argument("--sample", type=int, default=60, help="mutants of each part (default 60)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw: tests that a draw led to need another one")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--report", action="store_true", help="run nothing, report the results that are there")
     options = parser.parse_args()
@@ -54,11 +55,11 @@ def main() -> None:
             for kernels in Path("torchkcreg").glob("_C*"):  # built by pip install --editable
                 shutil.copy(kernels, clone / kernels)
         for part in options.parts:
-            run(part, options.work, options.sample)
+            run(part, options.work, options.sample, options.seed)
     report(options.parts, options.work)
 
 
-def run(part: str, work: Path, sample: int) -> None:
+def run(part: str, work: Path, sample: int, seed: int) -> None:
     """Draw ``sample`` mutants of a part, unless they were drawn before, and test those that are left."""
     from cosmic_ray.work_db import WorkDB, use_db
     from cosmic_ray.work_item import WorkerOutcome, WorkResult
@@ -86,7 +87,7 @@ def run(part: str, work: Path, sample: int) -> None:
             waiting = sorted(item.job_id for item in database.pending_work_items)
             order = {item.job_id: repr(item.mutations[0]) for item in database.work_items}
             waiting.sort(key=order.__getitem__)  # not by job_id, which is random
-            chosen = set(random.Random(0).sample(waiting, min(sample, len(waiting))))
+            chosen = set(random.Random(seed).sample(waiting, min(sample, len(waiting))))
             left_out = [job for job in waiting if job not in chosen]
             database.set_multiple_results(left_out, WorkResult(WorkerOutcome.SKIPPED))
     tool("cosmic-ray", "baseline", str(config))  # the tests must pass without a mutant

@@ -211,3 +211,9 @@ def test_a_state_of_another_grid_is_refused_and_one_without_a_grid_is_taken():
         other.load_state_dict(given.state_dict())
     older = {name: value for name, value in given.state_dict().items() if "extra" not in name}
     FreeFormDeformation(fine).load_state_dict(older)
+
+
+def test_no_points_have_no_displacements_for_any_number_of_candidates():
+    grid = ControlPointGrid((4, 4, 4), (1.0, 1.0, 1.0), torch.eye(4))
+    control_points = torch.ones(2, 5, 4, 4, 4, 3)
+    assert spline_displacement(grid, control_points, torch.zeros(7, 0, 3)).shape == (2, 5, 7, 0, 3)

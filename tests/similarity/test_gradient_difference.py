@@ -80,3 +80,26 @@ def test_what_a_masked_pixel_holds_does_not_matter(bad):
     expected, given = GradientDifference(fixed, mask), GradientDifference(spoiled, mask)
     assert torch.equal(given(moving), expected(moving))
     assert float(given(moving)) < 0.9
+
+
+def test_images_of_another_shape_are_refused_larger_and_smaller():
+    gd = GradientDifference(images(2, 12, 12))
+    for shape in ((2, 12, 13), (2, 12, 11), (3, 12, 12), (1, 12, 12), (12, 12)):
+        with pytest.raises(ValueError):
+            gd(torch.zeros(shape))
+    for shape in ((12, 12), (1, 2, 12, 12)):
+        with pytest.raises(ValueError, match="fixed must have shape"):
+            GradientDifference(torch.zeros(shape))
+
+
+def test_weighted_means_are_taken_out_of_every_derivative():
+    """An even ramp changes nothing away from the border, where the Sobel filter repeats the outermost pixels."""
+    fixed, weights = images(2, 16, 16), images(2, 16, 16)
+    column, row = torch.arange(16.0), torch.arange(16.0)[:, None]
+    gd = GradientDifference(fixed, weights=weights)
+    tilted = fixed + 0.3 * column + 0.2 * row
+    inside = torch.ones(2, 16, 16, dtype=torch.bool)
+    inside[:, 0], inside[:, -1], inside[..., 0], inside[..., -1] = False, False, False, False
+    away = GradientDifference(fixed, inside, weights)
+    torch.testing.assert_close(away(tilted), away(fixed), atol=1e-5, rtol=0)
+    assert float(gd(tilted).max()) < 1.0

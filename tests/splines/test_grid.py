@@ -1,5 +1,7 @@
 """The lattice of control points."""
 
+import math
+
 import pytest
 import torch
 
@@ -75,6 +77,8 @@ def test_points_go_to_the_grid_and_vectors_come_back():
     [
         ((3, 4, 4), (1, 1, 1), torch.eye(4), "shape must"),
         ((4, 4, 4), (1, 0, 1), torch.eye(4), "spacing must"),
+        ((4, 4, 4), (1, -1, 1), torch.eye(4), "spacing must"),
+        ((4, 4, 4), (1, math.inf, 1), torch.eye(4), "spacing must"),
         ((4, 4, 4), (1, 1, 1), torch.eye(3), "frame must"),
         ((4, 4, 4), (1, 1, 1), torch.diag(torch.tensor([1.0, 1, -1, 1])), "frame must"),
         ((4, 4, 4), (1, 1, 1), 2 * torch.eye(4), "frame must"),
