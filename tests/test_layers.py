@@ -112,6 +112,7 @@ REASONS = {
     "optimization/adam.py": "one optimiser, one file",
     "optimization/cmaes.py": "one optimiser, one file",
     "projector/voxel_ops.py": "operators stand beside their reference and their module",
+    "search/region.py": "where an implant may be, apart from how it is searched there",
     "similarity/similarity.py": "the interface of a user's own similarity",
     "physics/detector.py": "the one conversion of counts to line integrals",
     "visualization/case.py": "one figure, one file",
@@ -234,7 +235,7 @@ def test_only_io_reads_and_writes_files():
 
 
 FACTORIES = {"arange", "empty", "eye", "full", "linspace", "ones", "rand", "randn", "tensor", "zeros"}
-ON_ANY_DEVICE = ("deformation", "optimization", "projector", "registration", "scene", "similarity", "splines")
+ON_ANY_DEVICE = ("deformation", "optimization", "projector", "registration", "scene", "search", "similarity", "splines")
 
 
 def without_device(path: Path) -> list[str]:

@@ -72,6 +72,7 @@ _FOLDERS = (
     "reconstruction",
     "registration",
     "scene",
+    "search",
     "similarity",
     "simulation",
     "splines",

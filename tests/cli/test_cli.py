@@ -116,8 +116,8 @@ def test_a_registration_starts_from_an_earlier_one_of_the_same_implant(small_cas
 
     names = {"geometry": small_case / "geometry.json", "projections": small_case / "projections.npz"}
     files = RegistrationFiles(implant=small_case / "implant.stl", init=finished, **names)
-    (start,) = read_inputs(files, RegistrationConfig(pitch_mm=1.0)).starts
-    torch.testing.assert_close(start, read_run(finished).implant_to_world)
+    (implant,) = read_inputs(files, RegistrationConfig(pitch_mm=1.0)).implants
+    torch.testing.assert_close(implant.implant_to_world, read_run(finished).implant_to_world)
     mesh = trimesh.load(small_case / "implant.stl")
     mesh.apply_translation([0, 30, 0])
     mesh.export(tmp_path / "elsewhere.stl")
@@ -137,7 +137,7 @@ def test_finite_elements_bend_an_implant_from_the_shape_of_an_earlier_run(small_
     files = RegistrationFiles(implant=small_case / "implant.stl", rest=finished, **names)
     config = RegistrationConfig(pitch_mm=1.0, deformation="fe", material="steel")
     inputs, before = read_inputs(files, config), read_run(finished)
-    torch.testing.assert_close(inputs.starts[0], before.implant_to_world)
+    torch.testing.assert_close(inputs.implants[0].implant_to_world, before.implant_to_world)
     points = inputs.implants[0].cloud.points.double()
     scene = build_scene(inputs.implants, config)
     torch.testing.assert_close(scene.assemblies[0].warp(points), before.warp(points), atol=1e-6, rtol=0)
@@ -344,12 +344,17 @@ def test_a_mesh_in_metres_is_noticed_and_its_size_said(small_case, tmp_path, cap
     assert not (tmp_path / "run").exists()
 
 
-def test_an_implant_outside_every_view_is_an_error(small_case, tmp_path, capsys):
+def test_an_implant_outside_every_view_is_searched_unless_the_start_is_given(small_case, tmp_path, capsys):
     mesh = trimesh.load(small_case / "implant.stl")
     mesh.apply_translation((0.0, 0.0, 900.0))
     mesh.export(tmp_path / "far.stl")
     out = tmp_path / "run"
-    assert "outside every view" in rejected(command(small_case, out, implant=tmp_path / "far.stl"), out, capsys)
+    arguments = command(small_case, out, implant=tmp_path / "far.stl", components=None)
+    assert "outside every view" in rejected([*arguments, "--start", "given"], out, capsys)
+    assert main([*arguments, "--dry-run", "--no-figures"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("searched, since the start pose does not agree with the images: implant")
+    assert "100 % within the image" in said
 
 
 def arrays_of(case):

@@ -8,7 +8,7 @@ from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import Objective, RegistrationConfig, Stage, Trainer, build_scene
 from torchkcreg.registration.steps import places
 
-CONFIG = RegistrationConfig(stages=(Stage(oversampling=1, margin_mm=None),), **GRID_OF_SCREWS)
+CONFIG = RegistrationConfig(start="given", stages=(Stage(oversampling=1, margin_mm=None),), **GRID_OF_SCREWS)
 
 
 def objective_at(shift_mm: float) -> Objective:

@@ -171,7 +171,8 @@ def test_data_that_do_not_fit_are_refused() -> None:
         RegistrationData(views, torch.zeros(3, 160, 96), empty)
     far = RegistrationData(views, torch.zeros(3, 160, 96))
     with pytest.raises(ValueError, match="outside every view"):
-        Trainer(scene(PLAIN, pose(300, 0)), far, PLAIN).check()
+        given = PLAIN.model_copy(update={"start": "given"})
+        Trainer(scene(given, pose(300, 0)), far, given).check()
 
 
 def test_unknown_options_are_refused_and_presets_split_groups() -> None:

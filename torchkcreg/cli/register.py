@@ -35,6 +35,12 @@ def add_register(commands) -> None:
     command.add_argument("--components", type=_path_or_none, action="append", help=screws)
     start = "start pose: implant_to_world (JSON), or the run folder of an earlier registration, such as without load"
     command.add_argument("--init", type=_path_or_none, action="append", help=start)
+    command.add_argument(
+        "--start",
+        choices=("auto", "given", "search"),
+        help="auto (default): search for the implant if the start pose does not agree with the images; given: start "
+        "from --init or the mesh's own frame; search: always search",
+    )
     rest = "run folder of a registration without load: its shape is the rest shape of the finite elements"
     command.add_argument("--rest", type=_path_or_none, action="append", help=rest)
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, if the file does not give it")
@@ -86,7 +92,7 @@ def _register(options: argparse.Namespace) -> Answer:
     materials = options.material if options.material and len(options.material) > 1 else None
     given = {**per_implant, "materials": materials, **{name: getattr(options, name) for name in single}}
     files = RegistrationFiles.of(given)
-    names = ("preset", "deformation", "pitch_mm", "seed", "backend", "device")
+    names = ("preset", "start", "deformation", "pitch_mm", "seed", "backend", "device")
     overrides = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     overrides |= {"material": options.material[0]} if options.material else {}
     if options.dry_run:
@@ -101,6 +107,8 @@ def _register(options: argparse.Namespace) -> Answer:
         summary = f"{runs}\n"
     else:
         result = register_files(files, options.out, resume=options.resume, **settings)
+    if result.searched:
+        summary += f"searched, since the start pose does not agree with the images: {', '.join(result.searched)}\n"
     similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())
     summary += f"{result.status}: gradient correlation of each view {similarity}; run folder {options.out}"
     data = {"folder": options.out, "status": result.status, "reasons": result.warnings, "gc": result.gc.tolist()}

@@ -12,7 +12,15 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry, fit_rigid, transform_points
-from torchkcreg.io import LAYERS, RunFolder, read_config, write_figure, write_geometry, write_layers
+from torchkcreg.io import (
+    LAYERS,
+    RunFolder,
+    implausible_magnification,
+    read_config,
+    write_figure,
+    write_geometry,
+    write_layers,
+)
 from torchkcreg.registration import (
     Callback,
     Progress,
@@ -78,6 +86,8 @@ def register_files(
     config = resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
     trainer = prepared_trainer(inputs, config)
+    if not resume:
+        find_start(trainer, inputs)
     record = run_record(files, config)
     run = RunFolder.create(out, overwrite=overwrite, resume=resume)
     if resume:
@@ -103,6 +113,16 @@ def prepared_trainer(inputs: RegistrationInputs, config: RegistrationConfig) -> 
     return trainer
 
 
+def find_start(trainer: Trainer, inputs: RegistrationInputs) -> None:
+    """Search for implants whose start does not agree with the images; doubts about where they are go to the inputs."""
+    trainer.find_start()
+    for assembly in trainer.scene:
+        nodes = assembly.nodes().cpu()
+        if (doubt := implausible_magnification(trainer.data.geometry.cpu().facing(nodes), nodes)) is not None:
+            inputs.warnings.append(doubt)
+            warnings.warn(doubt, stacklevel=3)
+
+
 def train(
     trainer: Trainer, run: RunFolder, inputs: RegistrationInputs, *, callbacks: Sequence[Callback] = ()
 ) -> RegistrationResult:
@@ -125,7 +145,7 @@ def write_run(
     more_metrics: dict[str, Any] | None = None,
 ) -> None:
     """Write metrics, figures and result of a finished registration to its run folder."""
-    starts = inputs.starts
+    starts = trainer.first_poses
     run.write_metrics({**_metrics(result, trainer.scene, starts, seconds), **(more_metrics or {})})
     if figures:
         for name, figure in draw_registration(result, trainer.data, starts).items():
@@ -194,6 +214,7 @@ def _metrics(result: RegistrationResult, scene: Scene, starts: Sequence[Tensor],
         "node_std_mm": result.diagnostics.get("node_std_mm"),
         **_motion(torch.cat(list(motions.values()))),
         "largest_bending_mm": max(bendings.values()),
+        "searched": list(result.searched),
         "implants": {name: {**_motion(m), "largest_bending_mm": bendings[name]} for name, m in motions.items()},
         "intensity": result.intensity,
         "screws_found": [screw.to_dict() for screw in result.screws_found],
@@ -228,8 +249,11 @@ def dry_run(files: RegistrationFiles, picture: Path | None, *, overrides: dict[s
     config = resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
     trainer = prepared_trainer(inputs, config)
+    find_start(trainer, inputs)
     scene, data = trainer.scene, trainer.data
     lines = []
+    if trainer.searched:
+        lines.append(f"searched, since the start pose does not agree with the images: {', '.join(trainer.searched)}")
     for implant, assembly in zip(inputs.implants, scene, strict=True):
         nodes = assembly.nodes(1).reshape(-1, 3).detach().cpu().double()
         size = " x ".join(f"{x:.1f}" for x in (nodes.amax(0) - nodes.amin(0)).tolist())

@@ -14,10 +14,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.geometry import transform_points
 from torchkcreg.implant import Component, ImplantPointCloud, find_holes
 from torchkcreg.io import (
-    implausible_magnification,
     read_components,
     read_config,
     read_geometry,
@@ -215,12 +213,6 @@ class RegistrationInputs:
     spectrum: Spectrum | None
     warnings: list[str]
 
-    @property
-    def starts(self) -> list[Tensor]:
-        """Start pose (4, 4) of each implant."""
-        still = torch.eye(4, dtype=torch.float64)
-        return [still if i.implant_to_world is None else i.implant_to_world for i in self.implants]
-
 
 def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> RegistrationInputs:
     """Read and check the inputs of a registration, without writing anything.
@@ -235,11 +227,6 @@ def read_inputs(files: RegistrationFiles, config: RegistrationConfig) -> Registr
         data = _read_data(files, config)
         spectrum = read_spectrum(files.spectrum) if files.spectrum else None
         implants = [read_implant(implant, config) for implant in each]
-        for implant in implants:
-            points, pose = implant.cloud.points, implant.implant_to_world
-            placed = points if pose is None else transform_points(pose, points.double())
-            if (doubt := implausible_magnification(data.facing(placed).geometry, placed)) is not None:
-                warnings.warn(doubt, stacklevel=2)
     return RegistrationInputs(implants, data, spectrum, notes)
 
 

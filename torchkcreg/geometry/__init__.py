@@ -10,6 +10,7 @@ from .cone_beam import ConeBeamGeometry
 from .frames import DetectorFrames, gantry_about_z
 from .multisource import MultisourceScanner
 from .packages import from_astra, from_leap, from_leap_cone, from_tigre, to_astra, to_leap
+from .rotation_grid import rotation_grid
 from .se3 import (
     across,
     fit_rigid,
@@ -47,6 +48,7 @@ __all__ = [
     "rigid_matrix",
     "rotation_about",
     "rotation_from_vector",
+    "rotation_grid",
     "to_astra",
     "to_leap",
     "transform_points",

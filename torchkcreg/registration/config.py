@@ -14,6 +14,7 @@ from torchkcreg.options import Config
 SimilarityName = Literal["gradient-correlation", "gradient-difference"]
 DeformationName = Literal["auto", "ffd", "modes", "fe"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
+StartName = Literal["auto", "given", "search"]
 
 PHYSICS = ("scatter", "removed", "blur", "hardness")  # parameters of a polyenergetic intensity model
 
@@ -28,6 +29,7 @@ PAPER: Mapping[str, Any] = MappingProxyType(
         "find_screws": False,
         "view_motion": "off",
         "undo_stages": False,
+        "start": "given",
     }
 )
 """Defaults of the preset "paper": the control points of section 2.4, and an objective of eq. 4 and 5 alone. The paper
@@ -170,6 +172,8 @@ class RegistrationConfig(Config):
         preset: Named schedule, used when `stages` is empty. "paper" also changes the defaults of other options to those
             of Cao et al. (2020), see `PAPER`; what is given beside it counts.
         stages: The schedule itself, see `Stage`.
+        start: "given": start from the given pose; "search": search for the implant in any orientation; "auto": search
+            only if the given pose does not agree with the images.
         material: Name of the implant's material; None keeps plain path lengths (the paper's DRR).
         deformation: How the implant bends: "ffd" by groups of control points (the paper's model), "modes" by groups
             along the implant's softest elastic modes, "fe" as an elastic body loaded at its holes; "auto" is "fe" where
@@ -213,6 +217,7 @@ class RegistrationConfig(Config):
 
     preset: PresetName = "gauss-newton"
     stages: tuple[Stage, ...] = ()
+    start: StartName = "auto"
     material: str | None = None
     deformation: DeformationName = "modes"
     pitch_mm: float = Field(0.25, gt=0)

@@ -41,11 +41,12 @@ class Guard:
 
     def state_dict(self) -> dict[str, Any]:
         """Saved state and misfit, as tensors and plain types."""
-        return {"kept": self.kept, "bin": self.bin, "misfit": self.misfit}
+        return {"kept": self.kept, "bin": self.bin, "misfit": self.misfit, "first_poses": self.first_poses}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a state of `state_dict`."""
         self.kept, self.bin, self.misfit = state["kept"], state["bin"], state["misfit"]
+        self.first_poses = list(state["first_poses"])
 
     def before(self, stage: Stage) -> None:
         """Save the scene's present state and its misfit for comparison after the stage."""

@@ -132,6 +132,7 @@ class RegistrationResult(RegisteredImplants):
         warnings: Reasons for caution, in words.
         diagnostics: Measures behind the verdict, see `Diagnostics`; `node_std_mm` is the expected root mean square
             error of the implant's nodes.
+        searched: Names of the implants whose start pose was searched.
         stages: One record a stage: iterations, converged, loss, undone.
         intensity: Estimated parameters of the intensity model.
         blur_mm: Standard deviation of the system's blur on the detector; 0 if not modelled.
@@ -148,6 +149,7 @@ class RegistrationResult(RegisteredImplants):
     status: Status = "ok"
     warnings: list[str] = field(default_factory=list)
     diagnostics: dict[str, Any] = field(default_factory=dict)
+    searched: tuple[str, ...] = ()
     stages: list[dict[str, Any]] = field(default_factory=list)
     intensity: dict[str, float] = field(default_factory=dict)
     blur_mm: float = 0.0

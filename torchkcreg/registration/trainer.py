@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from torchkcreg.callbacks import Callback
@@ -25,7 +26,8 @@ from .guard import Guard
 from .registered_implant import RegisteredImplant
 from .result import RegistrationResult
 from .stage import StageRun, Step, Terms, coarse, similarities
-from .steps import AFTER, BEFORE, CHANGE_SCENE
+from .start import find_start
+from .steps import AFTER, BEFORE, CHANGE_SCENE, rigid_stages
 from .verdict import Rival, judge
 
 log = logging.getLogger(__name__)
@@ -43,6 +45,7 @@ def finished(
     undone: dict[str, str],
     rival: Rival | None,
     stopped: str | None,
+    searched: tuple[str, ...] = (),
 ) -> RegistrationResult:
     """The result of a registration from its final scene."""
     run = StageRun(scene, data, last, config, terms=terms)
@@ -65,6 +68,7 @@ def finished(
         stages=list(records),
         config=config,
         seed=config.seed,
+        searched=searched,
         status=status,
         warnings=reasons,
         diagnostics=asdict(diagnostics),
@@ -193,6 +197,7 @@ class Trainer:
         self.history: list[dict[str, Any]] = []
         self.records: list[StageRecord] = []
         self.rival: Rival | None = None
+        self.searched: tuple[str, ...] | None = None  # None: not looked at yet
         self.stopped: str | None = None
         self._deadline = None if seconds is None else time.perf_counter() + seconds
         self._guard = Guard(scene, self.data, config)
@@ -212,7 +217,9 @@ class Trainer:
                 raise ValueError(f"{unknown[0]!r} cannot be estimated: {', '.join(sorted(known))} can")
 
     def check(self) -> None:
-        """Raise ValueError if an implant lies outside every view at its start pose."""
+        """Raise ValueError if an implant lies outside every view at its start pose, and is not to be searched."""
+        if self.config.start != "given":
+            return
         margin = (self.stages[0].margin_mm or 0.0) / self.data.geometry.pixel_spacing[1]
         for assembly in self.scene:
             self.data.windowed(assembly.nodes(1), margin)
@@ -236,13 +243,33 @@ class Trainer:
             undone=self.undone,
             rival=self.rival,
             stopped=self.stopped,
+            searched=self.searched or (),
         )
 
     def run(self) -> float:
-        """Run the remaining stages and return the misfit."""
+        """Run the remaining stages, after a search for the start if need be, and return the misfit."""
+        self.find_start()
         while self.next_stage < len(self.stages) and self.stopped is None:
             self._run_stage(self.next_stage)
         return self._guard.misfit
+
+    def find_start(self) -> None:
+        """Search for implants whose start pose does not agree with the images, once; `fit` does it first."""
+        if self.searched is not None:
+            return
+        found = find_start(self.scene, self.data, self.config, self._rigid_trial)
+        self.searched, self.rival = found.names, found.rival
+        if found.names:
+            log.info("searched for: %s", ", ".join(found.names))
+            self._guard = Guard(self.scene, self.data, self.config)
+
+    @property
+    def first_poses(self) -> list[Tensor]:
+        """Pose (4, 4) of each implant from which the stages began."""
+        return [pose.cpu() for pose in self._guard.first_poses]
+
+    def _rigid_trial(self, scene: Scene, data: RegistrationData) -> float:
+        return self._trial(rigid_stages(self.stages), scene, data)
 
     def _run_stage(self, index: int) -> None:
         stage, start = self.stages[index], time.perf_counter()
@@ -266,7 +293,7 @@ class Trainer:
         optimizer = run.begin()
         if not run.accepted:
             run.accept(optimizer.best())
-        self.rival = run.rival or self.rival
+        self.rival = min(filter(None, (run.rival, self.rival)), key=lambda rival: rival.ratio, default=None)
         undone = self._guard.after()
         last = optimizer.progress
         self.records.append(StageRecord(last.iteration, optimizer.converged, last.loss, undone))
@@ -305,9 +332,12 @@ class Trainer:
         self._run, self._kept_run = run, None
         return run
 
-    def _trial(self, stages: tuple[Stage, ...]) -> float:
-        config = self.config.model_copy(update={"stages": stages})
-        return Trainer(self.scene, self.data, config, terms=self.terms, steps=self.steps).run()
+    def _trial(
+        self, stages: tuple[Stage, ...], scene: Scene | None = None, data: RegistrationData | None = None
+    ) -> float:
+        config = self.config.model_copy(update={"stages": stages, "start": "given"})
+        with torch.enable_grad():
+            return Trainer(scene or self.scene, data or self.data, config, terms=self.terms, steps=self.steps).run()
 
     @property
     def undone(self) -> dict[str, str]:
@@ -320,6 +350,7 @@ class Trainer:
         return {
             "registered": self.scene.description(),
             "scene": self.scene.kept(),
+            "searched": None if self.searched is None else list(self.searched),
             "next_stage": self.next_stage,
             "history": self.history,
             "records": [asdict(record) for record in self.records],
@@ -338,6 +369,7 @@ class Trainer:
         if differ := sorted(n for n in expected.keys() | given.keys() if expected.get(n) != given.get(n)):
             raise ValueError(f"the checkpoint does not fit this registration: {', '.join(differ)} differ")
         self.scene.restore(state["scene"])
+        self.searched = None if state["searched"] is None else tuple(state["searched"])
         self.next_stage, self.history = int(state["next_stage"]), list(state["history"])
         self.records = [StageRecord(**record) for record in state["records"]]
         self.rival = None if state["rival"] is None else Rival(**state["rival"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 Status = Literal["ok", "doubtful", "failed"]
 
@@ -17,7 +17,7 @@ _DEVIATION_FOUND_MM = 0.085  # with found screws: their metal and shape may be w
 _SEEN, _HARDLY_SEEN = 0.05, 0.3  # of the implant's volume
 _YIELD = 0.0035  # root mean square strain
 _SURPRISING = 4.0  # mean square of loads in standard deviations; of plates on screws it is one, and up to 2.7
-_APART_MM, _ALIKE = 2.0, 1.2  # least distance of another place, and largest ratio of misfits
+_ALIKE = 1.2  # largest ratio of the misfits of two places that the images do not tell apart
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,20 @@ class Rival:
         distance_mm: Root mean square distance of the implants' nodes there from where they fit best.
         misfit: Unexplained share of the images there.
         best_misfit: Unexplained share at the best place.
+        pose: Pose (4, 4) there, from the implant's frame to the world, for `--init`; None if it is near the start.
     """
+
+    APART_MM: ClassVar[float] = 2.0  # nearer places are the same
 
     distance_mm: float
     misfit: float
     best_misfit: float
+    pose: list[list[float]] | None = None
+
+    @property
+    def ratio(self) -> float:
+        """Misfit there over that at the best place; infinite if there is none."""
+        return self.misfit / self.best_misfit if self.best_misfit > 0 else math.inf
 
 
 @dataclass(frozen=True)
@@ -150,7 +159,7 @@ def _doubts(diagnostics: Diagnostics) -> list[str]:
         reasons.append("the last stage did not converge: it needs more iterations")
     reasons += [f"{name} ended at its bound" for name in diagnostics.at_bounds]
     rival = diagnostics.rival
-    if rival and rival.distance_mm > _APART_MM and rival.misfit < _ALIKE * rival.best_misfit:
+    if rival and rival.distance_mm > Rival.APART_MM and rival.misfit < _ALIKE * rival.best_misfit:
         reasons.append(f"the implant fits nearly as well {rival.distance_mm:.1f} mm away")
     # That the first stage, on coarse pixels, does not improve on a good start says nothing.
     reasons += [f"stage {stage} was undone: {why}" for stage, why in diagnostics.undone.items() if stage != "1"]

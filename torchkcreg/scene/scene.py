@@ -138,10 +138,14 @@ class Scene(nn.Module):
             physics["scatter_shapes"] = view.data.scatter_shapes
         return physics | self.intensity.of_sources(view.geometry.sources)
 
+    def with_only(self, assemblies: Sequence[Assembly]) -> Scene:
+        """A scene of some of the implants; assemblies and intensity model are shared, not copied."""
+        chosen = list(assemblies)
+        return Scene(chosen, self.intensity, metals=self.metals, materials=self.materials, backend=self.backend)
+
     def without_components(self, assembly: Assembly) -> Scene:
         """The scene with one implant stripped of its components; all else is shared."""
-        assemblies = [a.bare() if a is assembly else a for a in self.assemblies]
-        return Scene(assemblies, self.intensity, metals=self.metals, materials=self.materials, backend=self.backend)
+        return self.with_only([a.bare() if a is assembly else a for a in self.assemblies])
 
     def kept(self) -> dict[str, Any]:
         """Copy of all that a registration changes, as tensors and plain types, for `restore` and checkpoints."""
