@@ -223,3 +223,13 @@ def test_impossible_requests_are_refused() -> None:
     ):
         with pytest.raises(ValueError):
             request()
+
+
+def test_a_calibration_whose_rows_and_columns_differ_a_little_is_taken() -> None:
+    """Focal lengths of calibrated image intensifiers differ by half a percent between columns and rows."""
+    matrix = torch.tensor([[4577.0, 0, 395, 0], [0, 4602, 588, 0], [0, 0, 1, 1000]]).double()[None]
+    geometry = ConeBeamGeometry(matrix, (1024, 1024), (0.39, 0.39))
+    assert float(geometry.detector_distances) == pytest.approx(0.39 * (4577 + 4602) / 2)
+    wrong = ConeBeamGeometry(matrix, (1024, 1024), (0.39, 0.37))
+    with pytest.raises(ValueError, match="pixel aspect"):
+        wrong.detector_distances  # noqa: B018

@@ -12,6 +12,8 @@ from torchkcreg.precision import ExactModule
 
 from .orientation import checked_matrices, checked_shape, looking_signs, turned_towards
 
+_LARGEST_ASPECT = 0.02  # relative difference of the distances that rows and columns give
+
 
 class ConeBeamGeometry(ExactModule):
     """Views of a cone-beam system: `u = P0.X / P2.X` (column), `v = P1.X / P2.X` (row), X = (x, y, z, 1) in mm.
@@ -119,12 +121,12 @@ class ConeBeamGeometry(ExactModule):
         changes the end of the ray by `depth * |M^-1 e_u|`, which equals du on the detector.
 
         Raises:
-            ValueError: Row and column spacing give distances that differ by more than 0.1 %, so they do not fit the
-                matrix.
+            ValueError: Row and column spacing give distances that differ by more than 2 %, so they do not fit the
+                matrix. Calibrations of image intensifiers differ by up to 1 %.
         """
         steps = torch.linalg.inv(self.projection_matrices[:, :, :3])[:, :, :2].norm(dim=1)  # (V, 2): du, dv
         distances = steps.new_tensor(self.pixel_spacing[::-1]) / steps
-        if bool(((distances[:, 0] / distances[:, 1] - 1).abs() > 1e-3).any()):
+        if bool(((distances[:, 0] / distances[:, 1] - 1).abs() > _LARGEST_ASPECT).any()):
             raise ValueError(f"pixel_spacing {self.pixel_spacing} does not fit the projection matrices' pixel aspect")
         return distances.mean(1)
 

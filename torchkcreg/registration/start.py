@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import rotation_grid, transform_points
+from torchkcreg.physics import material, material_names
 from torchkcreg.progress import progress_bar
 from torchkcreg.projector import project_points
 from torchkcreg.scene import Assembly, RegistrationData, Scene
@@ -26,6 +27,7 @@ _TRIED, _WORSE = (
     0.7,
 )  # candidates that the rigid stages are run from, and their least similarity relative to the best
 _TRIAL_VIEWS = 6
+_ENERGY_KEV, _UNNAMED = 60.0, "steel"
 
 Trial = Callable[[Scene, RegistrationData], float]
 
@@ -59,17 +61,24 @@ def find_start(scene: Scene, data: RegistrationData, config: RegistrationConfig,
     if config.start == "given":
         return FoundStart()
     by_size = sorted(scene, key=lambda assembly: float(assembly.implant.volumes.sum()), reverse=True)
-    searches = {assembly.name: PoseSearch(data, partial(body_of, assembly)) for assembly in by_size}
+    searches = {a.name: PoseSearch(data, partial(body_of, a), attenuation=_attenuation(a)) for a in by_size}
     placed = [a for a in by_size if config.start == "auto" and agrees(searches[a.name], a)]
     lost = [assembly for assembly in by_size if assembly not in placed]
     rival = None
     for assembly in lost:
         search = searches[assembly.name]
         if placed:
-            search = PoseSearch(data, partial(body_of, assembly), partial(drawn, tuple(placed)))
+            others = partial(drawn, tuple(placed))
+            search = PoseSearch(data, partial(body_of, assembly), others, attenuation=_attenuation(assembly))
         placed.append(assembly)
         rival = _placed(assembly, search, scene.with_only(placed), data, trial)
     return FoundStart(tuple(assembly.name for assembly in lost), rival)
+
+
+def _attenuation(assembly: Assembly) -> float:
+    """Attenuation of an implant's metal at the mean energy of a tube, 1/mm; of iron-like metal if it is not named."""
+    name = assembly.material if assembly.material in material_names() else _UNNAMED
+    return float(material(name).attenuation(_ENERGY_KEV))
 
 
 def body_of(assembly: Assembly, pitch_mm: float) -> Body:

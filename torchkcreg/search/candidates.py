@@ -56,7 +56,7 @@ class Candidates:
     Attributes:
         rotations: Rotations (K, 3, 3) from the implant's frame to the world, float64.
         centers: Positions (K, 3) of the centre of mass in the world, mm, float64.
-        similarity: Mean gradient correlation over the views, (K,).
+        similarity: Correlation of gradients on and around the body's shadow, mean over the views, (K,).
     """
 
     rotations: Tensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -16,10 +17,11 @@ from .region import aimed_at, spread_views
 
 _ROTATIONS = 4608
 _SHADOWS = 512  # places from one view that are compared in all views
-_DEPTH_STEPS, _DEPTH_STEP_MM = 12, 8.0  # to either side, along the ray, about the place that the views are aimed at
+_ROUGH = 1.5  # relative pixels on which depths are compared
+_DEPTH_STEP_MM = 8.0  # along the ray, as far as half of the field of view, about where the views are aimed at
 _MOST_VIEWS = 4
 _COARSEST_MM, _PIXELS_ALONG = 4.0, 25.0  # pixels, at most so large and so many along the implant's longest radius
-_MOST_NODES = 1500
+_MOST_NODES, _MOST_PIXELS = 1500, 5000  # pixels of a view: larger detectors have coarser ones, up to 1.5 times
 # Relative pixels, candidates refined on them, and iterations. Coarser pixels draw candidates from further away, but the
 # outlines of neighbouring views say little on them.
 _PATHS = (((1.0, 96, 10),), ((2.5, 64, 8), (1.5, 48, 6), (1.0, 32, 6)))
@@ -38,6 +40,7 @@ class PoseSearch:
     Args:
         data: Measured images; of many views, four that lie far apart are used.
         body_at: Makes the body for a pitch of its nodes, mm.
+        attenuation: Of the implant's metal, 1/mm, at the energies of a tube: about 0.9 for steel, 0.3 for titanium.
         others: Renders path lengths (V, rows, cols) of what else is known, for images of some size; None for nothing.
         rotations: Number of rotations.
     """
@@ -48,6 +51,7 @@ class PoseSearch:
         body_at: Callable[[float], Body],
         others: Callable[[RegistrationData], Tensor] | None = None,
         *,
+        attenuation: float = 0.5,
         rotations: int = _ROTATIONS,
     ) -> None:
         views = spread_views(data.geometry, _MOST_VIEWS)
@@ -56,10 +60,15 @@ class PoseSearch:
         self.near, self.num_rotations = aimed_at(geometry), rotations
         depths = geometry.projection_matrices[:, 2, :3] @ self.near + geometry.projection_matrices[:, 2, 3]
         self._magnification = float((geometry.detector_distances / depths).mean())
+        edges = (size * spacing for size, spacing in zip(geometry.det_shape, geometry.pixel_spacing, strict=True))
+        self._reach_mm = 0.5 * max(edges) / self._magnification
         extent = body_at(_COARSEST_MM).extent_mm
-        self.pixel_mm = min(_COARSEST_MM, 2 * extent * self._magnification / _PIXELS_ALONG)
-        self._body_at, self._others = body_at, others
+        finest = min(_COARSEST_MM, 2 * extent * self._magnification / _PIXELS_ALONG)
+        area = math.prod(geometry.det_shape) * math.prod(geometry.pixel_spacing)
+        self.pixel_mm = min(max(finest, (area / _MOST_PIXELS) ** 0.5), 1.5 * finest)
+        self._body_at, self._others, self._attenuation = body_at, others, attenuation
         self.coarse = self._views(self.pixel_mm)
+        self._rough = self._views(_ROUGH * self.pixel_mm, self.coarse.body)
 
     def _views(self, pixel_mm: float, body: Body | None = None) -> CoarseViews:
         if body is None:
@@ -68,7 +77,7 @@ class PoseSearch:
             while len(body.volumes) > _MOST_NODES * (self.pixel_mm / pixel_mm) ** 2:
                 pitch *= 1.25
                 body = self._body_at(pitch)
-        return CoarseViews(self.data, body, self.near, pixel_mm, self._others)
+        return CoarseViews(self.data, body, self.near, pixel_mm, self._attenuation, self._others)
 
     def placed(self, rotations: Tensor, number: int) -> Candidates:
         """The best `number` of the rotations (K, 3, 3), each at its best place, unrefined."""
@@ -76,10 +85,11 @@ class PoseSearch:
         shadows = self.coarse.shadows(rotations, view).best(number)
         source = self.data.geometry.source_positions[view]
         rays = torch.nn.functional.normalize(shadows.centers - source, dim=-1)
-        steps = torch.arange(-_DEPTH_STEPS, _DEPTH_STEPS + 1, dtype=rays.dtype, device=rays.device) * _DEPTH_STEP_MM
+        number_of = math.ceil(self._reach_mm / _DEPTH_STEP_MM)
+        steps = torch.arange(-number_of, number_of + 1, dtype=rays.dtype, device=rays.device) * _DEPTH_STEP_MM
         centers = (shadows.centers[:, None] + steps[:, None] * rays[:, None]).flatten(0, 1)
         turns = shadows.rotations.repeat_interleave(len(steps), 0)
-        compared = self.coarse.compared(turns, centers)
+        compared = self._rough.compared(turns, centers)
         best = compared.similarity.unflatten(0, (len(shadows), -1)).argmax(1)
         return compared[torch.arange(len(shadows), device=best.device) * len(steps) + best]
 
