@@ -307,7 +307,7 @@ def test_bad_pixels_are_masked_counted_and_said_in_one_line(small_case, tmp_path
         ({"pitch": -1}, "pitch_mm"),
         ({"pitch": "fine"}, "--pitch"),
         ({"seed": "x"}, "--seed"),
-        ({"views": "0,one"}, "views must be integers"),
+        ({"views": "0,one"}, "views must be such as 3,4-10,0:200:20"),
         ({"views": "0,3"}, "there is no view 3"),
         ({"views": "-1"}, "there is no view -1"),
         ({"views": "0,1,0"}, "got view 0 2 times"),
@@ -519,3 +519,36 @@ def test_a_failed_registration_is_exit_status_3_and_is_written(small_case, tmp_p
 def read_run_quietly(folder):
     with pytest.warns(UserWarning, match="is failed"):
         return read_run(folder)
+
+
+def test_views_are_lists_ranges_and_slices() -> None:
+    from argparse import ArgumentTypeError
+
+    from torchkcreg.cli.register import _views
+
+    assert _views("15,16,17") == [15, 16, 17]
+    assert _views("4-7,0:20:5,9") == [4, 5, 6, 7, 0, 5, 10, 15, 9]
+    assert _views("2:4") == [2, 3]
+    assert (_views("all"), _views("auto")) == ("all", "auto")
+    for wrong in ("", "a", "4-", "7-4", "0:5:0", "1;2"):
+        with pytest.raises(ArgumentTypeError, match="views must be such as"):
+            _views(wrong)
+
+
+def test_of_many_views_those_that_lie_far_apart_are_used(tmp_path) -> None:
+    from itertools import pairwise
+
+    from torchkcreg.commands import RegistrationFiles
+    from torchkcreg.geometry import circular_geometry
+    from torchkcreg.io import write_geometry
+
+    ring = circular_geometry(range(0, 200), sad=404, sdd=538, det_shape=(64, 64), pixel_spacing=(3.0, 3.0))
+    write_geometry(tmp_path / "scan.json", ring)
+    write_geometry(tmp_path / "few.json", ring.select(list(range(20))))
+    files = {name: tmp_path / f"{name}.none" for name in ("implant", "projections")}
+    chosen = RegistrationFiles(geometry=tmp_path / "scan.json", **files).with_views().views
+    assert len(chosen) == 24 and min(b - a for a, b in pairwise(chosen)) >= 5
+    assert RegistrationFiles(geometry=tmp_path / "few.json", **files).with_views().views is None
+    given = RegistrationFiles(geometry=tmp_path / "scan.json", views=[3, 4], **files)
+    assert given.with_views() is given
+    assert RegistrationFiles(geometry=tmp_path / "few.json", views="all", **files).with_views().views == list(range(20))

@@ -27,7 +27,12 @@ def add_register(commands) -> None:
         help="intensities or line integrals (NPZ, MHA, TIFF, a folder, YAML, ...)",
     )
     command.add_argument("--out", type=Path, required=True, help="run folder to write")
-    command.add_argument("--views", type=_integers, help="views to use, such as 15,16,17 (default: all)")
+    command.add_argument(
+        "--views",
+        type=_views,
+        help="views to use: 15,16,17 or 4-10 or 0:200:20 (from, before, step), or all; auto (default): of more than 24 "
+        "those 24 that lie furthest apart",
+    )
     steel = "material of the implant, such as steel: makes DRRs polyenergetic; always give it"
     command.add_argument("--material", action="append", help=steel)
     command.add_argument("--spectrum", type=Path, help="detected spectrum: energy in keV, weight (CSV)")
@@ -75,15 +80,31 @@ def _only(values: list | None) -> Any:
     return values[0] if values is not None and len(values) == 1 else values
 
 
-def _integers(text: str) -> list[int]:
+def _views(text: str) -> list[int] | str:
+    """Views such as 3,4-10,0:200:20 as a list; "all" and "auto" as they are."""
+    if text in ("all", "auto"):
+        return text
+    views: list[int] = []
     try:
-        return [int(part) for part in text.split(",")]
+        for part in text.split(","):
+            if ":" in part:
+                start, stop, step = (int(number) for number in [*part.split(":"), "1"][:3])
+                views += range(start, stop, step)
+            elif "-" in part.strip()[1:]:
+                first, last = (int(number) for number in part.split("-"))
+                views += range(first, last + 1)
+            else:
+                views.append(int(part))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"views must be integers separated by commas, got {text!r}") from None
+        views = []
+    if not views:
+        raise argparse.ArgumentTypeError(f"views must be such as 3,4-10,0:200:20 or all or auto, got {text!r}")
+    return views
 
 
 def _register(options: argparse.Namespace) -> Answer:
     from torchkcreg.commands import RegistrationFiles, dry_run, register_files, register_seeds
+    from torchkcreg.io import read_config
 
     if options.seeds is not None and options.resume:
         raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")
@@ -107,6 +128,8 @@ def _register(options: argparse.Namespace) -> Answer:
         summary = f"{runs}\n"
     else:
         result = register_files(files, options.out, resume=options.resume, **settings)
+    if files.views is None and (used := read_config(options.out / "config.yaml")["files"].get("views")):
+        summary += f"{len(used)} views, spread over all directions: {', '.join(map(str, used))}\n"
     if result.searched:
         summary += f"searched, since the start pose does not agree with the images: {', '.join(result.searched)}\n"
     similarity = " ".join(f"{gc:.3f}" for gc in result.gc.tolist())

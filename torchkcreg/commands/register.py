@@ -83,7 +83,7 @@ def register_files(
         FileExistsError: If `out` holds a run and neither overwrite nor resume is set.
     """
     start = time.perf_counter()
-    config = resolve_config(files.config, overrides or {})
+    files, config = files.with_views(), resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
     trainer = prepared_trainer(inputs, config)
     if not resume:
@@ -246,12 +246,14 @@ def dry_run(files: RegistrationFiles, picture: Path | None, *, overrides: dict[s
     Raises:
         ValueError, FileNotFoundError: As `register_files`.
     """
-    config = resolve_config(files.config, overrides or {})
+    files, config = files.with_views(), resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
     trainer = prepared_trainer(inputs, config)
     find_start(trainer, inputs)
     scene, data = trainer.scene, trainer.data
     lines = []
+    if files.view_list is not None:
+        lines.append(f"views {', '.join(map(str, files.view_list))}")
     if trainer.searched:
         lines.append(f"searched, since the start pose does not agree with the images: {', '.join(trainer.searched)}")
     for implant, assembly in zip(inputs.implants, scene, strict=True):

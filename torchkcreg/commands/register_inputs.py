@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,7 +32,9 @@ from torchkcreg.plain import first_line
 from torchkcreg.registration import Implant, RegisteredImplant, RegistrationConfig
 from torchkcreg.registration.implant import bends_elastically
 from torchkcreg.scene import RegistrationData
+from torchkcreg.search import spread_views
 
+MOST_VIEWS = 24  # more take longer, and what the model has wrong in all of them stays
 RECORD_KEYS = {"files", "options", "schedule"}  # of a run's config.yaml
 _FEWEST_NODES_ALONG = 4
 _SAME_FRAME_MM = 5.0  # tolerance between bounds of nodes and mesh: nodes do not reach the surface
@@ -122,7 +124,7 @@ class RegistrationFiles:
         rest: Run folder of a registration of the implant without load; its shape is the rest shape of the finite
             elements.
         materials: Material of each implant, if they differ.
-        views: Views to use; None for all.
+        views: Views to use, or "all"; None for all of up to 24, or of more the 24 that lie furthest apart.
         open_beam: Unattenuated intensity, if the projections' file does not give it.
         config: Options as YAML or JSON.
     """
@@ -135,9 +137,25 @@ class RegistrationFiles:
     init: Path | Sequence[Path | None] | None = None
     rest: Path | Sequence[Path | None] | None = None
     materials: Sequence[str] | None = None
-    views: list[int] | None = None
+    views: list[int] | Literal["all"] | None = None
     open_beam: float | None = None
     config: Path | None = None
+
+    @property
+    def view_list(self) -> list[int] | None:
+        """Views to use; None for all."""
+        return self.views if isinstance(self.views, list) else None
+
+    def with_views(self) -> RegistrationFiles:
+        """The files with a list of views, if all are asked for, or if there are more than are of use."""
+        if isinstance(self.views, list):
+            return self
+        geometry = read_geometry(self.geometry, projections=self.projections)
+        if self.views == "all":
+            return replace(self, views=list(range(geometry.num_views)))
+        if geometry.num_views <= MOST_VIEWS:
+            return self
+        return replace(self, views=spread_views(geometry, MOST_VIEWS, opposite=True))
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> RegistrationFiles:
@@ -150,6 +168,8 @@ class RegistrationFiles:
         recorded = options.get("files") if options.keys() == RECORD_KEYS else None
         files = {key: _path(key, value) for key, value in (recorded or {}).items() if key in cls.__dataclass_fields__}
         files |= {key: value for key, value in given.items() if value is not None}
+        if files.get("views") == "auto":
+            files["views"] = None
         if missing := [f"--{name}" for name in ("implant", "geometry", "projections") if files.get(name) is None]:
             raise ValueError(f"a registration needs {', '.join(missing)} (or --config with the config.yaml of a run)")
         return cls(**files)
@@ -237,7 +257,7 @@ def _check_options(files: RegistrationFiles, config: RegistrationConfig) -> None
             material(name)
     elif files.spectrum is not None:
         raise ValueError("a spectrum needs the implant's material: name it with --material")
-    views = files.views or []
+    views = files.view_list or []
     if twice := sorted({view for view in views if views.count(view) > 1}):
         raise ValueError(f"views must be distinct, got view {twice[0]} {views.count(twice[0])} times")
 
@@ -255,13 +275,13 @@ def _read_data(files: RegistrationFiles, config: RegistrationConfig) -> Registra
     geometry = read_geometry(files.geometry, projections=files.projections)
     projections = read_projections(files.projections, open_beam=files.open_beam)
     projections.check_against(geometry)
-    if files.views is not None:
+    if files.view_list is not None:
         projections = (
-            read_projections(files.projections, open_beam=files.open_beam, views=files.views)
+            read_projections(files.projections, open_beam=files.open_beam, views=files.view_list)
             if projections.num_masked  # read again, to count masked pixels in these views only
-            else projections.select(files.views)
+            else projections.select(files.view_list)
         )
-        geometry = geometry.select(files.views)
+        geometry = geometry.select(files.view_list)
     if (note := projections.masked_note()) is not None:
         warnings.warn(f"projections file {files.projections}: {note}", stacklevel=2)
     largest = max(stage.bin for stage in config.schedule())

@@ -90,7 +90,7 @@ def register_seeds(
     if num_seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {num_seeds}")
     start = time.perf_counter()
-    config = resolve_config(files.config, overrides or {})
+    files, config = files.with_views(), resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
     prepared_trainer(inputs, config)  # raises on bad inputs before anything is written
     run = RunFolder.create(out, overwrite=overwrite)

@@ -30,13 +30,19 @@ def aimed_at(geometry: ConeBeamGeometry) -> Tensor:
     return (sources + _LIKELY_DEPTH * geometry.detector_distances[:, None] * rays).mean(0)
 
 
-def spread_views(geometry: ConeBeamGeometry, number: int) -> list[int]:
-    """Up to `number` views from directions as different as possible, starting with the middle one, in order."""
+def spread_views(geometry: ConeBeamGeometry, number: int, *, opposite: bool = False) -> list[int]:
+    """Up to `number` views from directions as different as possible, starting with the middle one, in order.
+
+    Args:
+        geometry: All views.
+        number: Number of views.
+        opposite: True if opposite directions are as good as different ones; they show the same outline.
+    """
     rays = torch.nn.functional.normalize(geometry.source_positions - aimed_at(geometry), dim=-1)
     chosen = [geometry.num_views // 2]
     while len(chosen) < min(number, geometry.num_views):
-        # Opposite views show the same outline, so directions count without their sign.
-        nearest = (rays @ rays[chosen].mT).abs().amax(-1)
+        cosines = rays @ rays[chosen].mT
+        nearest = (cosines if opposite else cosines.abs()).amax(-1)
         nearest[chosen] = 2.0
         chosen.append(int(nearest.argmin()))
     return sorted(chosen)
