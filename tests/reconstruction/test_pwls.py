@@ -169,3 +169,18 @@ def test_weights_are_those_of_poisson_counts_behind_scatter():
 def test_subsets_of_the_scanner_hold_all_focal_spots():
     geometry = MultisourceScanner(det_shape=(8, 8), det_size_mm=(298, 298)).geometry()
     assert VoxelSystem(geometry, GRID).sources == geometry.sources
+
+
+def test_negative_values_are_kept_if_they_may_be(problem):
+    signed = solve(problem, PWLSConfig(iterations=10, subsets=4, beta=0.1, nonnegative=False)).run().volume
+    assert signed.min() < -1e-4
+    assert solve(problem, PWLSConfig(iterations=10, subsets=4, beta=0.1)).run().volume.min() == 0.0
+
+
+def test_the_estimate_of_a_plain_full_step_is_the_objective_before_it(problem):
+    """With one subset and beta on, the misfit is that before the step and the roughness too."""
+    solver = solve(problem, PWLSConfig(iterations=3, subsets=1, momentum=False, beta=3000.0, objective_every=1))
+    history = solver.run().history
+    roughness = 3000.0 * float(VoxelRoughness(GRID.spacing).value(solver.volume))
+    assert roughness > 0.2 * history[-1]["estimate"]
+    assert history[-1]["estimate"] == pytest.approx(history[-2]["objective"], rel=0.1)

@@ -210,3 +210,48 @@ def test_a_panel_that_is_sharper_than_its_pixels_says_nothing() -> None:
     with torch.no_grad():
         here.intensity.get_parameter("blur_sigma_px").fill_(5.0)
     assert PhysicsParameters(here.intensity, ("scatter", "blur"), 1.0, 1.0).at_bounds(0.01) == ["blur"]
+
+
+@pytest.mark.parametrize(
+    ("flaw", "text"),
+    [
+        ({"misfit": 0.1}, "10 % of the images' contrast is left unexplained"),
+        ({"seen": [0.02, 0.0]}, "no view shows more than 2 % of the implant"),
+        ({"seen": [1.0, 0.2]}, "less than 30 % of the implant is seen in view 1"),
+        ({"strain": 0.0123}, "the implant is strained by 1.23 % (RMS)"),
+        ({"surprise": 9.0}, "it takes loads 3.0 times as strong"),
+        ({"gc": [0.95, 0.5]}, "gradient correlation is 0.50, less than 0.6"),
+        ({"gc": [0.95, 0.2]}, "gradient correlation is 0.20 in view 1"),
+        ({"node_std_mm": 0.25}, "off by 0.250 mm (RMS), more than 0.11 mm: views"),
+        ({"misfit": 0.3, "node_std_mm": 0.7}, "30 % of the images' contrast is left unexplained and the nodes are"),
+        ({"rival": Rival(16.04, 0.011, 0.01)}, "fits nearly as well 16.0 mm away"),
+        ({"undone": {"3": "it lost"}}, "stage 3 was undone: it lost"),
+        ({"at_bounds": ["scatter"]}, "scatter ended at its bound"),
+    ],
+)
+def test_a_reason_has_the_figure_and_its_limit(flaw: dict, text: str) -> None:
+    assert any(text in reason for reason in judge(replace(GOOD, **flaw))[1])
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        {"misfit": 0.08},
+        {"node_std_mm": 0.11},
+        {"gc": [0.6, 0.9]},
+        {"seen": [1.0, 0.3]},
+        {"strain": 0.0035},
+        {"surprise": 4.0},
+        {"rival": Rival(2.0, 0.01, 0.01)},
+        {"rival": Rival(16.0, 0.0121, 0.01)},
+        {"undone": {"1": "it lost"}},
+        {"screws_found": 3, "node_std_mm": 0.085},
+    ],
+)
+def test_a_figure_at_its_limit_is_ok(right: dict) -> None:
+    assert judge(replace(GOOD, **right)) == ("ok", [])
+
+
+@pytest.mark.parametrize("flaw", [{"gc": [0.3, 0.9]}, {"seen": [0.05, 0.05]}, {"node_std_mm": 2.0}, {"misfit": 0.2}])
+def test_a_figure_at_the_limit_of_failure_is_doubtful(flaw: dict) -> None:
+    assert judge(replace(GOOD, **flaw))[0] == "doubtful"
