@@ -25,7 +25,8 @@ PARTS = {
     "projector": ("torchkcreg/projector", "tests/projector tests/test_derivatives.py"),
     "fdk": (
         "torchkcreg/reconstruction/fdk.py",
-        "tests/reconstruction/test_fdk.py tests/reconstruction/test_redundancy.py tests/reconstruction/test_filtering.py",
+        "tests/reconstruction/test_fdk.py tests/reconstruction/test_redundancy.py "
+        "tests/reconstruction/test_filtering.py",
     ),
     "pwls": (
         "torchkcreg/reconstruction/pwls.py",
