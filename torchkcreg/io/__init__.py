@@ -9,6 +9,7 @@ from .files import read_json, write_figure, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
 from .implants import read_components, read_init, write_components, write_init
 from .matrix_tables import read_matrix_table, write_matrix_table
+from .mayacam import read_mayacam, write_mayacam
 from .meshes import MESH_SUFFIXES, WRITTEN_SUFFIXES, read_mesh, write_mesh
 from .point_clouds import (
     read_point_cloud_ply,
@@ -66,6 +67,7 @@ __all__ = [
     "read_json",
     "read_layers",
     "read_matrix_table",
+    "read_mayacam",
     "read_mesh",
     "read_point_cloud_ply",
     "read_points",
@@ -86,6 +88,7 @@ __all__ = [
     "write_json",
     "write_layers",
     "write_matrix_table",
+    "write_mayacam",
     "write_mesh",
     "write_point_cloud_ply",
     "write_points",

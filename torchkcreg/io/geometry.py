@@ -15,6 +15,7 @@ from torchkcreg.plain import finite_array, finite_number
 
 from .files import existing_place, read_json, write_json
 from .matrix_tables import SUFFIXES, read_matrix_table, write_matrix_table
+from .mayacam import is_mayacam, mayacam_files, read_mayacam
 from .rtk_geometry import read_rtk, write_rtk
 from .scans import image_header, is_dicom, read_dicom_geometry
 
@@ -31,13 +32,15 @@ def read_geometry(
     pixel_spacing: Sequence[float] | None = None,
     layout: str | None = None,
 ) -> ConeBeamGeometry:
-    """Read a cone-beam geometry from JSON, RTK XML, DICOM, or a table of matrices.
+    """Read a cone-beam geometry from JSON, RTK XML, DICOM, MayaCam, or a table of matrices.
 
     JSON has the keys `rows`, `cols`, `pixel_pitch_mm` (a number, or `[dv, du]`), `views`, a list of dicts with
     `projection_matrix` (3x4, world mm to homogeneous 0-based pixels), and optionally `angle_deg` and `source` (a label)
     in every view. Redundant keys are checked against the matrices: `source_mm` or `source_z_mm` of a view must agree
     within 0.1 mm, and `sdd_mm` must agree within 1 % with the source-detector distance that follows from pixel pitch
     and matrices. Other keys are ignored.
+
+    MayaCam 2.0 files of XMALab are one camera each, or a folder of them: see `read_mayacam`.
 
     DICOM files of C-arms, or a folder of them, hold the nominal geometry: see `read_dicom_geometry`. The other formats
     (`.xml`, see `read_rtk`; `.npy`, `.npz`, `.csv`, `.txt`, see `read_matrix_table`) do not define the pixels. For
@@ -57,6 +60,12 @@ def read_geometry(
     """
     file = existing_place(path, "geometry")
     suffix = file.suffix.lower()
+    cameras = mayacam_files(file) if file.is_dir() else [file] if is_mayacam(file) else []
+    if cameras:
+        try:
+            return read_mayacam(cameras, pixel_spacing=pixel_spacing, det_shape=det_shape)
+        except ValueError as error:
+            raise ValueError(f"geometry {path}: {error}") from error
     if is_dicom(file) or file.is_dir():
         try:
             return read_dicom_geometry(file)
