@@ -11,6 +11,7 @@ import torch
 
 from torchkcreg.geometry import ConeBeamGeometry, MultisourceScanner
 from torchkcreg.io import implausible_magnification, read_projections
+from torchkcreg.io.scans.plausible import aperture_rim
 
 
 def geometry() -> ConeBeamGeometry:
@@ -126,3 +127,33 @@ def test_an_object_in_another_unit_is_doubted_where_it_stands():
     assert "magnified 13" in (implausible_magnification(other, 0.1 * plate) or "")
     coarse = ConeBeamGeometry(views.projection_matrices, views.det_shape, tuple(0.1 * d for d in views.pixel_spacing))
     assert "behind the detector" in (implausible_magnification(coarse, plate) or "")
+
+
+def disc(size: int, radius: float) -> np.ndarray:
+    row, column = np.mgrid[:size, :size] - (size - 1) / 2
+    return np.hypot(row, column) < radius
+
+
+def test_the_rim_of_a_round_aperture_is_masked_and_nothing_else() -> None:
+    lit = disc(200, 95)
+    rim = aperture_rim(~lit[None])[0]
+    assert rim[disc(200, 95) & ~disc(200, 88)].all() and not rim[disc(200, 86)].any() and not rim[~lit].any()
+    spot = lit.copy()
+    spot[90:110, 90:110] = False  # opaque metal inside is no surroundings
+    assert not aperture_rim(~spot[None])[0][disc(200, 80)].any()
+
+
+def test_dead_lines_and_dead_pixels_are_no_aperture() -> None:
+    dead = np.zeros((1, 200, 200), dtype=bool)
+    dead[0, :, 0] = dead[0, 50] = dead[0, ::9, ::9] = True
+    assert not aperture_rim(dead).any()
+    dead[0, :, :8] = True  # a collimator's blade
+    assert aperture_rim(dead)[0, :, 8:15].any()
+
+
+def test_images_behind_a_round_aperture_say_what_is_masked(tmp_path) -> None:
+    counts = np.where(disc(100, 48), 900, 0).astype(np.uint16)[None]
+    np.savez(tmp_path / "scan.npz", intensity=counts, open_beam=1000.0)
+    projections = read_projections(tmp_path / "scan.npz")
+    assert "at the rim of the aperture" in (projections.masked_note() or "")
+    assert not projections.mask[0, 2, 50] and projections.mask[0, 50, 50]

@@ -102,3 +102,17 @@ def test_a_checkpoint_is_continued_without_another_search(monkeypatch: pytest.Mo
 
 def replace_stages(config: RegistrationConfig, number: int) -> RegistrationConfig:
     return config.model_copy(update={"stages": config.stages[:number]})
+
+
+def test_a_rigid_implant_is_searched_and_has_error_bars() -> None:
+    """Joint components and screws do not bend."""
+    config = RegistrationConfig(deformation="rigid", find_screws=False, pitch_mm=0.5)
+    assert all(stage.level.is_rigid for stage in config.schedule())
+    truth = pose(4.0, 20.0)
+    trainer = Trainer(scene(config, FAR), image(scene(PLAIN, truth)), config)
+    result = trainer.fit()
+    assert distance(result.implant_to_world, truth) < 0.05
+    nodes = plate().points.double()
+    assert float(result.implants[0].displacement(nodes).abs().max()) == 0.0
+    assert 0 < result.diagnostics["node_std_mm"] < 0.1
+    assert result.status == "ok", result.warnings

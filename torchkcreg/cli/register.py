@@ -54,7 +54,8 @@ def add_register(commands) -> None:
     command.add_argument("--preset", help="optimization schedule: gauss-newton, paper (CMA-ES) or adam")
     command.add_argument(
         "--deformation",
-        help="deformation model: modes (elastic modes, default), fe (loads at the holes), ffd (the paper's), auto",
+        help="deformation model: modes (elastic modes, default), fe (loads at the holes), ffd (the paper's), "
+        "rigid (a joint component, a screw), auto",
     )
     command.add_argument("--pitch", type=float, dest="pitch_mm", help="spacing of the implant's nodes, mm")
     command.add_argument("--seed", type=int, help="random seed")

@@ -111,7 +111,11 @@ def write_mayacam(folder: Path, geometry: ConeBeamGeometry) -> list[Path]:
         if np.linalg.det(rotation) < 0:
             raise ValueError(f"view {view} is mirrored: MayaCam's rows run downwards and its columns to the right")
         translation = np.linalg.solve(camera, matrix[:, 3])
-        blocks = {"camera matrix": np.triu(camera / camera[2, 2]), "rotation": rotation, "translation": translation[:, None]}
+        blocks = {
+            "camera matrix": np.triu(camera / camera[2, 2]),
+            "rotation": rotation,
+            "translation": translation[:, None],
+        }
         text = f"image size\n{cols},{rows}\n"
         for name, block in blocks.items():
             text += f"\n{name}\n" + "".join(",".join(f"{x:.12g}" for x in row) + "\n" for row in block)

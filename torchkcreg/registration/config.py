@@ -12,7 +12,7 @@ from torchkcreg.deformation import BendingPrior, Level
 from torchkcreg.options import Config
 
 SimilarityName = Literal["gradient-correlation", "gradient-difference"]
-DeformationName = Literal["auto", "ffd", "modes", "fe"]
+DeformationName = Literal["auto", "ffd", "modes", "fe", "rigid"]
 PresetName = Literal["gauss-newton", "paper", "adam"]
 StartName = Literal["auto", "given", "search"]
 
@@ -131,6 +131,9 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
     if preset == "paper":
         return _paper_stages(start)
     finest = {"groups": 10} if deformation == "ffd" else {"groups": 20, "modes": 40}
+    two = {"groups": 2}
+    if deformation == "rigid":
+        finest, two = {}, {}
     parts, every = ("screws", "tilts"), ("screws", "tilts", *PHYSICS)
     seen = {"pitch_factor": 2, "similarity": "gradient-difference"}
     fine = {"estimate": every, **seen}
@@ -141,8 +144,8 @@ def preset_stages(preset: PresetName, deformation: DeformationName = "modes") ->
     levels = [
         Stage(bin=8, pitch_factor=4, before=("find_screws",), estimate=parts, **coarse),
         Stage(bin=4, before=("find_screws", "background"), estimate=(*parts, *hardness), **seen, **coarse),
-        Stage(groups=2, bin=4, before=("choose_screws", "background"), estimate=every, **seen, **coarse),
-        Stage(groups=2, bin=2, before=after_others, **fine),
+        Stage(**two, bin=4, before=("choose_screws", "background"), estimate=every, **seen, **coarse),
+        Stage(**two, bin=2, before=after_others, **fine),
         Stage(**finest, bin=2, before=after_others, **fine),
         Stage(**finest, bin=1, before=("align", *after_others, *weighed), **(fine | {"estimate": (*every, "views")})),
     ]
@@ -176,8 +179,8 @@ class RegistrationConfig(Config):
             only if the given pose does not agree with the images.
         material: Name of the implant's material; None keeps plain path lengths (the paper's DRR).
         deformation: How the implant bends: "ffd" by groups of control points (the paper's model), "modes" by groups
-            along the implant's softest elastic modes, "fe" as an elastic body loaded at its holes; "auto" is "fe" where
-            the implant's stiffness is known, else "modes".
+            along the implant's softest elastic modes, "fe" as an elastic body loaded at its holes, "rigid" not at all,
+            such as a joint component or a screw; "auto" is "fe" where the implant's stiffness is known, else "modes".
         pitch_mm: Lattice pitch of the implant's point cloud, mm.
         grid_shape: Control points along the principal axes, shortest axis first; grown where the implant needs more.
         grid_grows: If False, the grid has exactly that shape, and an implant longer than its control points is refused.

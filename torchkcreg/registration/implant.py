@@ -12,6 +12,7 @@ from torchkcreg.deformation import (
     Deformation,
     FiniteElementDeformation,
     FreeFormDeformation,
+    RigidDeformation,
     bent_cloud,
     bent_hold,
     spread_of_rest,
@@ -65,6 +66,8 @@ def deformation_of(implant: Implant, config: RegistrationConfig) -> Deformation:
         return finite_elements(implant, config)
     if implant.rest is not None:
         raise ValueError("a shape without load is what finite elements bend: ask for them with --deformation fe")
+    if config.deformation == "rigid":
+        return RigidDeformation()
     grid = default_grid(
         implant.cloud.points, shape=config.grid_shape, spacing=config.grid_spacing_mm, grows=config.grid_grows
     )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchkcreg.geometry import rotation_grid, transform_points
-from torchkcreg.physics import material, material_names
+from torchkcreg.physics import material
 from torchkcreg.progress import progress_bar
 from torchkcreg.projector import project_points
 from torchkcreg.scene import Assembly, RegistrationData, Scene
@@ -77,8 +77,11 @@ def find_start(scene: Scene, data: RegistrationData, config: RegistrationConfig,
 
 def _attenuation(assembly: Assembly) -> float:
     """Attenuation of an implant's metal at the mean energy of a tube, 1/mm; of iron-like metal if it is not named."""
-    name = assembly.material if assembly.material in material_names() else _UNNAMED
-    return float(material(name).attenuation(_ENERGY_KEV))
+    try:
+        metal = material(assembly.material)
+    except ValueError:  # without a material, path lengths have the implant's name
+        metal = material(_UNNAMED)
+    return float(metal.attenuation(_ENERGY_KEV))
 
 
 def body_of(assembly: Assembly, pitch_mm: float) -> Body:

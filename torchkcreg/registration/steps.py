@@ -23,6 +23,7 @@ _LEAST_STRENGTH = 25.0  # in simulations up to 16 where the geometry was right, 
 _STEP_MM = 2.0  # a coarse image's optimum is a few mm wide
 _WORSE = 1.5  # times the least loss: what fits no better is no candidate
 _MOST = 3
+_MOST_RIGID = 3  # stages that tell places apart: finer pixels only cost time
 _SCREW_BIN = 8  # a screw is thinner than a coarser pixel
 _FEWEST_VIEWS = 2  # one alone is at odds with none
 _LOOKS = ("find_screws", "choose_screws")
@@ -206,8 +207,8 @@ def slide(run: StageRun) -> None:
 
 
 def rigid_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
-    """The leading rigid stages, with a screw search only in the second and no steps after the optimiser."""
-    rigid = itertools.takewhile(lambda stage: stage.level.is_rigid, stages)
+    """The leading rigid stages, up to three, with a screw search only in the second and no steps after the optimiser."""
+    rigid = itertools.islice(itertools.takewhile(lambda stage: stage.level.is_rigid, stages), _MOST_RIGID)
     return tuple(_bare(stage, looks=number == 1) for number, stage in enumerate(rigid))
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchkcreg.geometry import ConeBeamGeometry
 from torchkcreg.physics import COUNT_FLOOR, line_integrals_from_intensity
 
-from .plausible import ImageHeader, stuck_pixels
+from .plausible import ImageHeader, aperture_rim, stuck_pixels
 
 RELATIVE_FLOOR = 1e-6
 DIVIDED, COUNTED = 2.0, 50.0  # largest transmission; smallest open beam of a detector that counts
@@ -31,8 +31,8 @@ class Projections:
         line_integrals: float32 (V, rows, cols), finite everywhere (masked pixels hold a placeholder).
         mask: bool (V, rows, cols), True where a pixel is valid.
         num_masked: Number of masked pixels by reason: "not finite", "not positive" (intensities at or below zero, or
-            the dark field), "in the file's mask", "without open beam", "stuck at the ceiling". Reasons without pixels
-            are omitted.
+            the dark field), "in the file's mask", "without open beam", "stuck at the ceiling", "at the rim of the aperture".
+            Reasons without pixels are omitted.
         num_saturated: Number of pixels at the detector's saturation level; they are valid (see `read_projections`).
         header: Pixel spacing and axes from the file; None if it gives none.
     """
@@ -170,6 +170,10 @@ def _from_intensity(
     if ceiling is not None and (stuck := stuck_pixels(image, saturated, float(ceiling))).any():
         reasons["stuck at the ceiling"] = int((stuck & keep.numpy()).sum())
         keep = keep & ~torch.from_numpy(stuck)
+    rim = aperture_rim(finite & ~positive) & keep.numpy()
+    if rim.any():
+        reasons["at the rim of the aperture"] = int(rim.sum())
+        keep = keep & ~torch.from_numpy(rim)
     return Projections(line_integrals, keep, reasons, int(saturated.sum()))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
-from scipy.ndimage import binary_opening, median_filter
+from scipy.ndimage import binary_opening, binary_propagation, distance_transform_edt, median_filter
 from torch import Tensor
 
 from torchkcreg.geometry import ConeBeamGeometry
@@ -43,6 +43,10 @@ def implausible_images(line_integrals: Tensor, mask: Tensor) -> list[str]:
     return doubts
 
 
+# Surroundings of an aperture: least share of the pixels, and thickness and rim relative to the detector's width.
+_SURROUNDINGS, _THICK, _RIM = 0.01, 0.01, 0.04
+
+
 def stuck_pixels(image: NDArray, saturated: NDArray[np.bool_], ceiling: float) -> NDArray[np.bool_]:
     """Defective detector pixels (V, rows, cols): isolated pixels at the saturation level in every view.
 
@@ -55,6 +59,32 @@ def stuck_pixels(image: NDArray, saturated: NDArray[np.bool_], ceiling: float) -
         return np.zeros_like(saturated)
     dark = [median_filter(view.astype(np.float32), 5) < _ALONE * ceiling for view in image]
     return np.broadcast_to(thin & np.all(dark, axis=0), saturated.shape).copy()
+
+
+def aperture_rim(unlit: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (V, rows, cols) at the rim of an aperture: within 4 % of the detector's width of its unlit surroundings.
+
+    Apertures of image intensifiers and collimators leave a rim of half-shadow and glare, which looks like metal. Their
+    surroundings touch the detector's border, hold at least 1 % of its pixels and are no thin lines.
+
+    Args:
+        unlit: True for pixels without signal, (V, rows, cols).
+    """
+    size = min(unlit.shape[1:])
+    thick, width = max(3, round(_THICK * size)), max(1, round(_RIM * size))
+    rim = np.zeros_like(unlit)
+    for dark, around in zip(unlit, rim, strict=True):
+        if dark.mean() < _SURROUNDINGS or dark.all():
+            continue
+        border = np.ones_like(dark)
+        border[1:-1, 1:-1] = False
+        # What lies beyond the detector is taken as unlit, else opening would erode corners.
+        padded = np.pad(dark, thick, mode="edge")
+        solid = binary_opening(padded, np.ones((thick, thick)))[thick:-thick, thick:-thick] & dark
+        outside = binary_propagation(solid & border, mask=dark)
+        if outside.mean() >= _SURROUNDINGS:
+            around |= (distance_transform_edt(~outside) <= width) & ~dark
+    return rim
 
 
 @dataclass(frozen=True)
