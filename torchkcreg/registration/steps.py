@@ -207,7 +207,7 @@ def slide(run: StageRun) -> None:
 
 
 def rigid_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
-    """The leading rigid stages, up to three, with a screw search only in the second and no steps after the optimiser."""
+    """Up to three leading rigid stages, with a screw search only in the second and no steps after the optimiser."""
     rigid = itertools.islice(itertools.takewhile(lambda stage: stage.level.is_rigid, stages), _MOST_RIGID)
     return tuple(_bare(stage, looks=number == 1) for number, stage in enumerate(rigid))
 

@@ -31,8 +31,8 @@ class Projections:
         line_integrals: float32 (V, rows, cols), finite everywhere (masked pixels hold a placeholder).
         mask: bool (V, rows, cols), True where a pixel is valid.
         num_masked: Number of masked pixels by reason: "not finite", "not positive" (intensities at or below zero, or
-            the dark field), "in the file's mask", "without open beam", "stuck at the ceiling", "at the rim of the aperture".
-            Reasons without pixels are omitted.
+            the dark field), "in the file's mask", "without open beam", "stuck at the ceiling", "at the rim of the
+            aperture". Reasons without pixels are omitted.
         num_saturated: Number of pixels at the detector's saturation level; they are valid (see `read_projections`).
         header: Pixel spacing and axes from the file; None if it gives none.
     """
