@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import logging
@@ -117,6 +118,8 @@ def one_line(message: object) -> str:
 
 def _told(error: Exception) -> str:
     """Error message in one line. Unexpected errors also name their type and the module they came from."""
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None and error.strerror:
+        return one_line(error.strerror)
     if isinstance(error, (ValueError, OSError)) and not isinstance(error, UnicodeError):
         return one_line(error)
     files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)[1:]]

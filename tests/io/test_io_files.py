@@ -1,5 +1,8 @@
+import errno
 import json
 import math
+import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,3 +95,17 @@ def test_a_missing_file_and_a_folder_are_told_apart(tmp_path):
 def test_an_array_of_another_shape_or_kind_is_refused_by_name(value):
     with pytest.raises(ValueError, match=r"^radii must be"):
         finite_array(value, (3,), "radii")
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), RuntimeError("fail after write")])
+def test_a_full_disk_is_named_whatever_the_writer_says(error, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=10))
+    full = r"the disk is full, .*volume\.mha was not written: make room"
+    with pytest.raises(OSError, match=full) as told, atomic_path(tmp_path / "volume.mha"):
+        raise error
+    assert told.value.errno == errno.ENOSPC and not list(tmp_path.iterdir())
+
+
+def test_another_error_is_no_full_disk(tmp_path):
+    with pytest.raises(RuntimeError, match="something else"), atomic_path(tmp_path / "volume.mha"):
+        raise RuntimeError("something else")

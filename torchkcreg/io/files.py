@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import codecs
+import errno
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +18,7 @@ from torchkcreg.plain import plain
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_ROOM = 1 << 16  # bytes; with less than that a disk is full
 TEMPORARY_PREFIX = ".writing-"
 
 
@@ -49,6 +52,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary name keeps the suffix, since many writers choose the format by it.
 
+    Raises:
+        OSError: The disk is full; the message says so, whatever the writer raised.
+
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
     >>> with atomic_path(folder / "answer.txt") as temporary:
@@ -65,8 +71,20 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
+    except Exception as error:
+        if _is_full(path.parent, error):
+            advice = "make room, then run it again (register and reconstruct continue with --resume)"
+            raise OSError(errno.ENOSPC, f"the disk is full, {path} was not written: {advice}") from error
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _is_full(folder: Path, error: Exception) -> bool:
+    """True if writing into a folder failed for want of room; some writers raise errors that do not say so."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return shutil.disk_usage(folder).free < _ROOM
 
 
 def physical_memory() -> float:
