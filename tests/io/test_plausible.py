@@ -157,3 +157,11 @@ def test_images_behind_a_round_aperture_say_what_is_masked(tmp_path) -> None:
     projections = read_projections(tmp_path / "scan.npz")
     assert "at the rim of the aperture" in (projections.masked_note() or "")
     assert not projections.mask[0, 2, 50] and projections.mask[0, 50, 50]
+
+
+def test_display_images_are_doubted(tmp_path) -> None:
+    image = np.full((1, 40, 40), 200, dtype=np.uint8)
+    image[0, 10:20, 10:20] = 60
+    np.savez(tmp_path / "display.npz", intensity=image, open_beam=255.0)
+    with pytest.warns(UserWarning, match="8 bits are made for display"):
+        read_projections(tmp_path / "display.npz")

@@ -152,6 +152,12 @@ def _from_intensity(
     if lit.mean() < MOSTLY:
         raise ValueError("open_beam must be above the dark field, or 0 without one, in most pixels")
     largest = image.max() if image.dtype.kind in "ui" else None
+    if image.dtype == np.uint8:
+        warnings.warn(
+            "images of 8 bits are made for display, not in proportion to the intensity: outlines are right, but expected "
+            "errors are too small",
+            stacklevel=4,
+        )
     ceiling = saturation if saturation is not None else largest if largest in DETECTOR_CEILINGS else None
     if ceiling is not None and ceiling <= 0:
         raise ValueError(f"saturation must be positive, got {ceiling}")
