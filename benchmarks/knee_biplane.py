@@ -1,4 +1,4 @@
-"""Real X-rays of a knee replacement in two calibrated views, registered from nowhere, against poses fitted to the edges.
+"""Real X-rays of a knee replacement in two calibrated views, registered from nowhere, against fits to their edges.
 
     python benchmarks/knee_biplane.py DATA --work /tmp/knee [--frames 0 60 100 160 250] [--write]
 

@@ -154,8 +154,8 @@ def _from_intensity(
     largest = image.max() if image.dtype.kind in "ui" else None
     if image.dtype == np.uint8:
         warnings.warn(
-            "images of 8 bits are made for display, not in proportion to the intensity: outlines are right, but expected "
-            "errors are too small",
+            "images of 8 bits are made for display, not in proportion to the intensity: outlines are right, but "
+            "expected errors are too small",
             stacklevel=4,
         )
     ceiling = saturation if saturation is not None else largest if largest in DETECTOR_CEILINGS else None
