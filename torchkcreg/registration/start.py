@@ -22,10 +22,8 @@ from .verdict import Rival
 _ROTATIONS, _PLACED = 256, 32  # of a quick search that a given start is compared with
 _AGREES = 0.85  # times the best similarity of the quick search: a start that agrees is at least so similar
 _OTHERS_PITCH_MM = 2.0
-_TRIED, _WORSE = (
-    8,
-    0.7,
-)  # candidates that the rigid stages are run from, and their least similarity relative to the best
+# Candidates that the rigid stages are run from, and their least similarity relative to the best.
+_TRIED, _WORSE = 8, 0.7
 _TRIAL_VIEWS = 6
 _ENERGY_KEV, _UNNAMED = 60.0, "steel"
 
@@ -103,7 +101,7 @@ def drawn(assemblies: Sequence[Assembly], data: RegistrationData) -> Tensor:
             body.volumes.to(total),
             data.geometry.projection_matrices.to(total),
             data.geometry.det_shape,
-            cell=body.cell.to(total),
+            cell=body.cell.to(total) @ assembly.implant_to_world[:3, :3].mT.to(total),
         )
     return total
 

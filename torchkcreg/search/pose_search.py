@@ -43,6 +43,10 @@ class PoseSearch:
         attenuation: Of the implant's metal, 1/mm, at the energies of a tube: about 0.9 for steel, 0.3 for titanium.
         others: Renders path lengths (V, rows, cols) of what else is known, for images of some size; None for nothing.
         rotations: Number of rotations.
+
+    Attributes:
+        coarse: The views on coarse pixels.
+        body: The body whose poses `candidates` returned last.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class PoseSearch:
         self.pixel_mm = min(max(finest, (area / _MOST_PIXELS) ** 0.5), 1.5 * finest)
         self._body_at, self._others, self._attenuation = body_at, others, attenuation
         self.coarse = self._views(self.pixel_mm)
+        self.body = self.coarse.body
         self._rough = self._views(_ROUGH * self.pixel_mm, self.coarse.body)
 
     def _views(self, pixel_mm: float, body: Body | None = None) -> CoarseViews:
