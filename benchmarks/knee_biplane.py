@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from torchkcreg.commands import RegistrationFiles, register_files
-from torchkcreg.geometry import transform_points
+from torchkcreg.geometry import transform_points, vector_from_rotation
 from torchkcreg.io import read_mesh, read_run
 
 RESULTS = Path(__file__).parent / "results" / "knee_biplane.csv"
@@ -70,7 +70,7 @@ def row(data: Path, frame: int, name: str, result, expected) -> dict[str, object
     here = result.implant(stem).implant_to_world
     points = torch.from_numpy(np.array(read_mesh(data / f"{stem}.stl").vertices))
     one, other = transform_points(here, points), transform_points(there, points)
-    turn = torch.rad2deg(torch.acos((((here[:3, :3] @ there[:3, :3].T).trace() - 1) / 2).clamp(-1, 1)))
+    turn = vector_from_rotation(here[:3, :3] @ there[:3, :3].T).norm().rad2deg()
     found = {
         "frame": frame,
         "component": name,

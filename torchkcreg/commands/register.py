@@ -86,8 +86,6 @@ def register_files(
     files, config = files.with_views(), resolve_config(files.config, overrides or {})
     inputs = read_inputs(files, config)
     trainer = prepared_trainer(inputs, config)
-    if not resume:
-        find_start(trainer, inputs)
     record = run_record(files, config)
     run = RunFolder.create(out, overwrite=overwrite, resume=resume)
     if resume:
@@ -117,8 +115,9 @@ def find_start(trainer: Trainer, inputs: RegistrationInputs) -> None:
     """Search for implants whose start does not agree with the images; doubts about where they are go to the inputs."""
     trainer.find_start()
     for assembly in trainer.scene:
-        nodes = assembly.nodes().cpu()
-        if (doubt := implausible_magnification(trainer.data.geometry.cpu().facing(nodes), nodes)) is not None:
+        nodes = assembly.nodes()
+        doubt = implausible_magnification(trainer.data.facing(nodes).geometry, nodes)
+        if doubt is not None and doubt not in inputs.warnings:
             inputs.warnings.append(doubt)
             warnings.warn(doubt, stacklevel=3)
 
@@ -126,7 +125,8 @@ def find_start(trainer: Trainer, inputs: RegistrationInputs) -> None:
 def train(
     trainer: Trainer, run: RunFolder, inputs: RegistrationInputs, *, callbacks: Sequence[Callback] = ()
 ) -> RegistrationResult:
-    """Run the trainer with checkpoints in the run folder; return the result, with the warnings of the inputs first."""
+    """Find the start, run the trainer with checkpoints in the run folder; return the result, inputs' warnings first."""
+    find_start(trainer, inputs)
     trainer.callbacks += [_Checkpoints(run), *callbacks]
     result = trainer.fit().to("cpu")
     trainer.data = trainer.data.to("cpu")

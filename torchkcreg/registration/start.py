@@ -59,15 +59,17 @@ def find_start(scene: Scene, data: RegistrationData, config: RegistrationConfig,
     if config.start == "given":
         return FoundStart()
     by_size = sorted(scene, key=lambda assembly: float(assembly.implant.volumes.sum()), reverse=True)
-    searches = {a.name: PoseSearch(data, partial(body_of, a), attenuation=_attenuation(a)) for a in by_size}
+
+    def search_beside(assembly: Assembly, others: Sequence[Assembly]) -> PoseSearch:
+        shown = partial(drawn, tuple(others)) if others else None
+        return PoseSearch(data, partial(body_of, assembly), shown, attenuation=_attenuation(assembly))
+
+    searches = {assembly.name: search_beside(assembly, ()) for assembly in by_size}
     placed = [a for a in by_size if config.start == "auto" and agrees(searches[a.name], a)]
     lost = [assembly for assembly in by_size if assembly not in placed]
     rival = None
     for assembly in lost:
-        search = searches[assembly.name]
-        if placed:
-            others = partial(drawn, tuple(placed))
-            search = PoseSearch(data, partial(body_of, assembly), others, attenuation=_attenuation(assembly))
+        search = search_beside(assembly, placed) if placed else searches[assembly.name]
         placed.append(assembly)
         rival = _placed(assembly, search, scene.with_only(placed), data, trial)
     return FoundStart(tuple(assembly.name for assembly in lost), rival)
