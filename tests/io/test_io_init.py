@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchkcreg.geometry import rigid_matrix
-from torchkcreg.io import read_init, write_init
+from torchkcreg.io import read_init, read_tra, write_init, write_tra
 
 
 @pytest.fixture
@@ -82,3 +82,26 @@ def test_a_file_without_a_pose_is_refused(tmp_path):
         read_init(written(tmp_path, {"pose": 1}))
     with pytest.raises(ValueError, match="must be 4 x 4 numbers"):
         read_init(written(tmp_path, [[1, 0, 0, 0]] * 3))
+
+
+def test_poses_over_frames_are_read_back_with_their_gaps(tmp_path):
+    turn = rigid_matrix(torch.tensor([0.3, -0.2, 0.5]).double(), torch.tensor([1.0, 2.0, 3.0]).double())
+    poses = torch.stack([turn, torch.full((4, 4), torch.nan).double()])
+    write_tra(tmp_path / "bone.tra", poses)
+    torch.testing.assert_close(read_tra(tmp_path / "bone.tra"), poses, equal_nan=True, atol=1e-7, rtol=0)
+    torch.testing.assert_close(read_init(tmp_path / "bone.tra"), turn, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("1,2,3\n", "line 1: 16 numbers"),
+        ("1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n" + "2,0,0,0,0,2,0,0,0,0,2,0,0,0,0,1\n", "line 2: the matrix"),
+        (",".join(["NaN"] * 16), "no pose in its first line"),
+        ("\n", "is empty"),
+    ],
+)
+def test_poses_over_frames_that_are_none_are_refused(tmp_path, text, problem):
+    (tmp_path / "bone.tra").write_text(text)
+    with pytest.raises(ValueError, match=problem):
+        read_init(tmp_path / "bone.tra")

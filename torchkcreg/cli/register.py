@@ -26,6 +26,9 @@ def add_register(commands) -> None:
         type=Path,
         help="intensities or line integrals (NPZ, MHA, TIFF, a folder, YAML, ...)",
     )
+    frames = "projections of several frames of the same geometry, instead of --projections: each starts from the one "
+    frames += "before it; writes a run folder a frame and the motion over them"
+    command.add_argument("--frames", type=Path, nargs="+", metavar="PROJECTIONS", help=frames)
     command.add_argument("--out", type=Path, required=True, help="run folder to write")
     command.add_argument(
         "--views",
@@ -104,11 +107,16 @@ def _views(text: str) -> list[int] | str:
 
 
 def _register(options: argparse.Namespace) -> Answer:
-    from torchkcreg.commands import RegistrationFiles, dry_run, register_files, register_seeds
+    from torchkcreg.commands import RegistrationFiles, dry_run, register_files, register_frames, register_seeds
     from torchkcreg.io import read_config
 
     if options.seeds is not None and options.resume:
         raise ValueError("--seeds cannot be resumed: leave --resume or --seeds out")
+    if options.frames is not None:
+        for name in ("projections", "seeds"):
+            if getattr(options, name) is not None:
+                raise ValueError(f"--frames and --{name} exclude each other")
+        options.projections = options.frames[0]
     single = ("geometry", "projections", "spectrum", "views", "open_beam", "config")
     per_implant = {name: _only(getattr(options, name)) for name in ("implant", "components", "init", "rest")}
     materials = options.material if options.material and len(options.material) > 1 else None
@@ -123,6 +131,10 @@ def _register(options: argparse.Namespace) -> Answer:
         return Answer("\n".join(lines), {"said": lines, "picture": picture})
     summary = ""
     settings = {"overrides": overrides, "overwrite": options.overwrite, "figures": not options.no_figures}
+    if options.frames is not None:
+        series = register_frames(files, options.frames, options.out, resume=options.resume, **settings)
+        lost = all(status == "failed" for status in series.statuses)
+        return Answer(str(series), series.to_dict(), FAILED if lost else 0)
     if options.seeds is not None:
         runs = register_seeds(files, options.out, options.seeds, **settings)
         result = runs.result

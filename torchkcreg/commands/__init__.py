@@ -13,6 +13,7 @@ from .reconstruct import reconstruct_files, resolve_options
 from .reconstruct_inputs import registered_components
 from .reconstruct_options import ReconstructionFiles, ReconstructionOptions
 from .register import RegistrationFiles, dry_run, register_files, resolve_config
+from .register_frames import FrameSeries, register_frames
 from .report import write_report
 from .seeds import SeedRuns, register_seeds
 from .simulate import SimulatedFiles, simulate_files
@@ -21,6 +22,7 @@ from .warp import warp_files
 __all__ = [
     "Comparison",
     "FileEvaluation",
+    "FrameSeries",
     "ImplantLoad",
     "ReconstructionFiles",
     "ReconstructionOptions",
@@ -42,6 +44,7 @@ __all__ = [
     "plan_files",
     "reconstruct_files",
     "register_files",
+    "register_frames",
     "register_seeds",
     "registered_components",
     "resolve_config",

@@ -13,6 +13,7 @@ from .densitometry import MineralContent, mineral_content
 from .displacement_map import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
 from .fragments import Fragments, fragments_of
+from .frame_motion import FRAME_COLUMNS, FrameMotion, frame_motion
 from .point_errors import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
 from .regions import RegionStatistics, cylinder_region, region_statistics
 from .relative_motion import AXES, RelativeMotion, relative_motion
@@ -21,10 +22,12 @@ from .statistics import DistanceStatistics, distance_statistics, full_width_at_h
 
 __all__ = [
     "AXES",
+    "FRAME_COLUMNS",
     "Beads",
     "DisplacementMap",
     "DistanceStatistics",
     "Fragments",
+    "FrameMotion",
     "MineralContent",
     "PointMetrics",
     "RegionStatistics",
@@ -43,6 +46,7 @@ __all__ = [
     "find_beads",
     "fragments_of",
     "frame_changes",
+    "frame_motion",
     "full_width_at_half_maximum",
     "mineral_content",
     "nearest_node_distances",

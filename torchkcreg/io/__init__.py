@@ -7,7 +7,7 @@ key. Files are written atomically: a file is either complete or absent.
 from .config import read_config, write_config
 from .files import read_json, write_figure, write_json, write_text
 from .geometry import geometry_from_dict, geometry_to_dict, read_geometry, write_geometry
-from .implants import read_components, read_init, write_components, write_init
+from .implants import read_components, read_init, read_tra, write_components, write_init, write_tra
 from .matrix_tables import read_matrix_table, write_matrix_table
 from .mayacam import read_mayacam, write_mayacam
 from .meshes import MESH_SUFFIXES, WRITTEN_SUFFIXES, read_mesh, write_mesh
@@ -76,6 +76,7 @@ __all__ = [
     "read_rtk",
     "read_run",
     "read_spectrum",
+    "read_tra",
     "read_volume",
     "versions",
     "write_components",
@@ -99,5 +100,6 @@ __all__ = [
     "write_stack",
     "write_surface_vtu",
     "write_text",
+    "write_tra",
     "write_volume",
 ]

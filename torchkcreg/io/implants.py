@@ -1,9 +1,10 @@
-"""JSON files of an implant: its initial pose (rigid 4x4 `implant_to_world` matrix) and its screws (cylinders)."""
+"""Files of an implant: its initial pose (rigid 4x4 `implant_to_world`), poses over frames, and screws (cylinders)."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchkcreg.implant import Screw
 from torchkcreg.plain import finite_array, finite_number
 
-from .files import read_json, write_json
+from .files import read_json, write_json, write_text
 
 ROUNDING = 2e-3
 
@@ -80,13 +81,19 @@ def _triple(values: list[float]) -> tuple[float, float, float]:
 def read_init(path: str | os.PathLike[str]) -> Tensor:
     """The rigid transform (4, 4) float64 from the implant's frame to the world, mm.
 
-    The file holds `{"implant_to_world": [[...] x 4]}`, or the four rows alone. Rounded entries are only nearly a
-    rotation, so the nearest rotation is used. The translation is unchanged.
+    The file holds `{"implant_to_world": [[...] x 4]}`, or the four rows alone; of poses over frames (`.tra`), the first
+    frame's is read. Rounded entries are only nearly a rotation, so the nearest rotation is used. The translation is
+    unchanged.
 
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The matrix is missing, or it scales, shears, mirrors or projects.
     """
+    if Path(path).suffix.lower() == ".tra":
+        first = read_tra(path)[0]
+        if bool(first.isnan().any()):
+            raise ValueError(f"pose file {path} has no pose in its first line")
+        return first
     content = read_json(path, "initial pose")
     if isinstance(content, dict):
         if "implant_to_world" not in content:
@@ -101,6 +108,39 @@ def read_init(path: str | os.PathLike[str]) -> Tensor:
 def write_init(path: str | os.PathLike[str], implant_to_world: Tensor) -> None:
     """Write an initial pose as a JSON file for `read_init`."""
     write_json(path, {"implant_to_world": rigid(implant_to_world.detach().cpu().double(), "implant_to_world")})
+
+
+def read_tra(path: str | os.PathLike[str]) -> Tensor:
+    """Poses (F, 4, 4) over frames, as Autoscoper saves them: a line a frame, 16 numbers, the matrix row by row.
+
+    NaN stands for frames without a pose.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: A line has not 16 numbers, or its matrix is not rigid; the message names it.
+    """
+    poses = []
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        cells = line.replace(",", " ").split()
+        if not cells:
+            continue
+        try:
+            matrix = torch.tensor([float(cell) for cell in cells], dtype=torch.float64).reshape(4, 4)
+        except (ValueError, RuntimeError):
+            raise ValueError(f"pose file {path}, line {number}: 16 numbers are needed, a matrix row by row") from None
+        try:
+            poses.append(matrix if bool(matrix.isnan().any()) else rigid(matrix, "the matrix"))
+        except ValueError as error:
+            raise ValueError(f"pose file {path}, line {number}: {error}") from None
+    if not poses:
+        raise ValueError(f"pose file {path} is empty")
+    return torch.stack(poses)
+
+
+def write_tra(path: str | os.PathLike[str], poses: Tensor) -> None:
+    """Write poses (F, 4, 4) over frames for Autoscoper (`read_tra`); NaN stands for frames without one."""
+    rows = poses.detach().cpu().double().flatten(1).tolist()
+    write_text(path, "".join(",".join(f"{x:.9g}" for x in row).replace("nan", "NaN") + "\n" for row in rows))
 
 
 def rigid(matrix: Tensor, name: str, *, tolerance: float = ROUNDING) -> Tensor:

@@ -1,4 +1,4 @@
-"""Figure of an implant's motion under load: deflection along it, and the fragments' relative motion over the load."""
+"""Figures of motion: of an implant and its fragments under load, and of an implant over a series of frames."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from torchkcreg.evaluation import AXES, RelativeMotion
 
@@ -59,3 +60,33 @@ def _curves(figure, motions: Sequence[RelativeMotion], loads: Sequence[float]) -
             panel.set_xlabel("load (N)")
             panel.set_ylabel(f"{'rotation' if part == 0 else 'translation at the gap'} ({unit})")
     turns.legend(frameon=False, fontsize=9)
+
+
+def frames_figure(values: Tensor, std: Tensor, names: Sequence[str], *, title: str = "") -> Figure:
+    """Rotation and translation in each frame, with bars of one standard deviation.
+
+    Args:
+        values: Rotation vector (degrees) and translation (mm) in each frame, (F, 6); NaN leaves a gap.
+        std: Standard deviations (F, 6); NaN draws no bar.
+        names: Names of the frames.
+        title: Written above.
+    """
+    figure = new_figure(8.5, 5.2)
+    places = np.arange(len(names))
+    for panel, part, label in zip(
+        figure.subplots(2, 1, sharex=True), (0, 3), ("rotation (degrees)", "translation (mm)"), strict=True
+    ):
+        for row, axis in enumerate("xyz"):
+            value, error = (x[:, part + row].cpu().numpy() for x in (values, std))
+            bars = np.where(np.isfinite(error), error, 0.0)
+            style = {"marker": "o", "markersize": 4, "capsize": 2, "color": COLOURS[row]}
+            panel.errorbar(places, value, bars, label=axis, **style)
+        panel.axhline(0, color="0.6", linewidth=0.8, zorder=0)
+        panel.set_ylabel(label)
+        open_frame(panel)
+    figure.axes[0].legend(frameon=False, fontsize=9, ncols=3)
+    figure.axes[0].set_title(title, fontsize=11)
+    turned = 0 if sum(map(len, names)) < 60 else 45
+    figure.axes[1].set_xticks(places, names, rotation=turned, ha="right" if turned else "center")
+    figure.axes[1].set_xlabel("frame")
+    return figure
