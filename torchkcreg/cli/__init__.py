@@ -1,4 +1,4 @@
-"""The command line: `torchkcreg register | warp | evaluate | load | compare | simulate | reconstruct | ...`."""
+"""The command line: `torchkcreg assess | register | warp | evaluate | compare | load | reconstruct | ...`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import NoReturn
 import torchkcreg
 from torchkcreg.console import one_line, run_command
 
+from .assess import add_assess
 from .command import voice_of
 from .compare import add_compare
 from .completion import add_completion
@@ -59,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="torchkcreg", description=torchkcreg.__doc__)
     parser.add_argument("--version", action="version", version=f"torchkcreg {torchkcreg.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    add_assess(commands)
     add_register(commands)
     add_warp(commands)
     add_evaluate(commands)

@@ -32,7 +32,7 @@ def add_register(commands) -> None:
     command.add_argument("--out", type=Path, required=True, help="run folder to write")
     command.add_argument(
         "--views",
-        type=_views,
+        type=views_of,
         help="views to use: 15,16,17 or 4-10 or 0:200:20 (from, before, step), or all; auto (default): of more than 24 "
         "those 24 that lie furthest apart",
     )
@@ -84,7 +84,7 @@ def _only(values: list | None) -> Any:
     return values[0] if values is not None and len(values) == 1 else values
 
 
-def _views(text: str) -> list[int] | str:
+def views_of(text: str) -> list[int] | str:
     """Views such as 3,4-10,0:200:20 as a list; "all" and "auto" as they are."""
     if text in ("all", "auto"):
         return text

@@ -1,5 +1,7 @@
 """Functions behind the commands: from input files to a folder of results. One module per command, of the same name."""
 
+from .assess import VisitFiles, assess_files
+from .assessment import Assessment
 from .compare import Comparison, compare_files
 from .convert import convert
 from .demo import demo
@@ -20,6 +22,7 @@ from .simulate import SimulatedFiles, simulate_files
 from .warp import warp_files
 
 __all__ = [
+    "Assessment",
     "Comparison",
     "FileEvaluation",
     "FrameSeries",
@@ -30,6 +33,8 @@ __all__ = [
     "SeedRuns",
     "SimulatedFiles",
     "ViewPlan",
+    "VisitFiles",
+    "assess_files",
     "compare_files",
     "convert",
     "demo",

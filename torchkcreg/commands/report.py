@@ -85,7 +85,7 @@ def write_report(folder: Path, *, out: Path | None = None) -> Path:
         warnings=[str(text) for text in metrics.get("warnings") or []],
         rows=rows,
         scene=scene,
-        layers=_layers(folder),
+        layers=layers_of(folder),
         pictures=pictures,
         details=_details(folder),
         made_with=", ".join(f"{name} {version}" for name, version in versions.items() if isinstance(version, str)),
@@ -207,7 +207,7 @@ def _clouds(folder: Path) -> tuple[Tensor, Tensor, Tensor]:
     return torch.cat(points), torch.cat(moved), torch.cat(std)
 
 
-def _layers(folder: Path) -> list[tuple[str, bytes, bytes]]:
+def layers_of(folder: Path) -> list[tuple[str, bytes, bytes]]:
     """Label, measured view and overlay of each view; images as PNG."""
     held = read_layers(folder / LAYERS)
     if held is None:

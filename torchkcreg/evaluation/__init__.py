@@ -9,6 +9,7 @@ from torchkcreg.geometry import distance_to
 from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
 from .bead_shadows import bead_shadows, track_beads
 from .beads import Beads, find_beads
+from .bone_places import BONE_PLACES, bone_places
 from .densitometry import MineralContent, mineral_content
 from .displacement_map import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
@@ -22,6 +23,7 @@ from .statistics import DistanceStatistics, distance_statistics, full_width_at_h
 
 __all__ = [
     "AXES",
+    "BONE_PLACES",
     "FRAME_COLUMNS",
     "Beads",
     "DisplacementMap",
@@ -36,6 +38,7 @@ __all__ = [
     "align_to_surface",
     "bb_rmse",
     "bead_shadows",
+    "bone_places",
     "cylinder_region",
     "displacement_map",
     "distance_statistics",

@@ -28,6 +28,7 @@ class RelativeMotion:
     Attributes:
         axes: The axes in the world as rows, (3, 3).
         motion: Rigid motion (4, 4) of the upper fragment in the world, with the lower fragment held fixed.
+        lower_motion: Rigid motion (4, 4) of the lower fragment in the world: how the limb lies otherwise.
         rotation_deg: Rotation vector (3,) of the motion, degrees.
         rotation_std_deg: Its standard deviations.
         translation_mm: Translation (3,) at the gap, mm.
@@ -36,11 +37,17 @@ class RelativeMotion:
         heights: Heights (S,) of stations, mm from the implant's lower end.
         deflection_mm: Displacements (S, 3) of the implant at the stations relative to the lower fragment.
         deflection_std_mm: Their standard deviations.
+        angle_deg: Angle of the rotation and its standard deviation, degrees, (2,).
+        places: Further points (P, 3) of the upper fragment in the implant's frame.
+        places_mm: Their translations (P, 3), mm.
+        places_std_mm: Standard deviations of these.
+        lengths_mm: Lengths of their translations and standard deviations, (P, 2), mm.
         fragments: Names of the screws in the lower and the upper fragment.
     """
 
     axes: Tensor
     motion: Tensor
+    lower_motion: Tensor
     rotation_deg: Tensor
     rotation_std_deg: Tensor
     translation_mm: Tensor
@@ -49,6 +56,11 @@ class RelativeMotion:
     heights: Tensor
     deflection_mm: Tensor
     deflection_std_mm: Tensor
+    angle_deg: Tensor
+    places: Tensor
+    places_mm: Tensor
+    places_std_mm: Tensor
+    lengths_mm: Tensor
     fragments: tuple[tuple[str, ...], tuple[str, ...]]
 
     @property
@@ -69,6 +81,7 @@ class RelativeMotion:
             "translation_std_mm": self.translation_std_mm,
             "gap_mm": self.gap,
             "motion": self.motion,
+            "lower_motion": self.lower_motion,
             "stations": {**stations, "deflection_std_mm": self.deflection_std_mm},
         }
 
@@ -93,6 +106,7 @@ def relative_motion(
     fragments: Fragments,
     *,
     to_second: Tensor | None = None,
+    places: Tensor | None = None,
 ) -> RelativeMotion:
     """Motion of one bone fragment relative to the other between two registrations of an implant.
 
@@ -106,14 +120,18 @@ def relative_motion(
         cloud: The undeformed implant in the first registration's frame.
         fragments: Fragments in the first registration's frame; exchanged if the upper one is lower in the world.
         to_second: Rigid transform (4, 4) from the first registration's frame of the implant to the second's.
+        places: Points (P, 3) in the first registration's frame of the implant that move with the upper fragment, such
+            as on the bone's axis, whose translations are wanted.
     """
     nodes = cloud.points.double()
+    places = nodes[:0] if places is None else places.to(nodes)
+    count = len(places)
     upwards = first.warp(fragments.upper).mean(0) - first.warp(fragments.lower).mean(0)
     if float(upwards[2]) < 0:
         fragments, upwards = fragments.swapped(), -upwards
     axes = _axes(first, nodes, upwards)
     heights, centers = _stations(cloud, first.warp(nodes) @ axes[2])
-    groups = (fragments.lower, fragments.upper, fragments.gap[None], centers)
+    groups = (fragments.lower, fragments.upper, torch.cat([fragments.gap[None], places]), centers)
     points = torch.cat(groups)
     in_second = points if to_second is None else transform_points(to_second, points)
     sizes = [len(group) for group in groups]
@@ -125,11 +143,13 @@ def relative_motion(
         return back, back @ fit_rigid(up0, up1)
 
     def numbers(before: Tensor, after: Tensor) -> Tensor:
-        (*_, gap, line), (*_, moved) = before.split(sizes), after.split(sizes)
+        (*_, spots, line), (*_, moved) = before.split(sizes), after.split(sizes)
         back, motion = motions(before, after)
         turned = torch.rad2deg(axes @ vector_from_rotation(motion[:3, :3]))
-        shifted = axes @ (transform_points(motion, gap) - gap)[0]
-        return torch.cat([turned, shifted, ((transform_points(back, moved) - line) @ axes.mT).flatten()])
+        shifted = (transform_points(motion, spots) - spots) @ axes.mT  # of the gap, then of the places
+        bent = (transform_points(back, moved) - line) @ axes.mT
+        lengths = torch.cat([turned.norm()[None], shifted[1:].norm(dim=-1)])
+        return torch.cat([turned, shifted.flatten(), lengths, bent.flatten()])
 
     before, after = first.warp(points), second.warp(in_second)
     values = numbers(before, after)
@@ -142,17 +162,27 @@ def relative_motion(
             squares += (numbers(before, after + field) - values).square()
     unknown = first.deviations is None or second.deviations is None
     std = torch.full_like(values, torch.nan) if unknown else squares.sqrt()
+    parts = [3, 3, 3 * count, 1, count, 3 * len(centers)]
+    turn, shift, there, angle, lengths, bend = values.split(parts)
+    turn_std, shift_std, there_std, angle_std, lengths_std, bend_std = std.split(parts)
+    back, motion = motions(before, after)
     return RelativeMotion(
         axes=axes,
-        motion=motions(before, after)[1],
-        rotation_deg=values[:3],
-        rotation_std_deg=std[:3],
-        translation_mm=values[3:6],
-        translation_std_mm=std[3:6],
+        motion=motion,
+        lower_motion=invert_rigid(back),
+        rotation_deg=turn,
+        rotation_std_deg=turn_std,
+        translation_mm=shift,
+        translation_std_mm=shift_std,
         gap=fragments.gap,
         heights=heights,
-        deflection_mm=values[6:].unflatten(0, (-1, 3)),
-        deflection_std_mm=std[6:].unflatten(0, (-1, 3)),
+        deflection_mm=bend.unflatten(0, (-1, 3)),
+        deflection_std_mm=bend_std.unflatten(0, (-1, 3)),
+        angle_deg=torch.cat([angle, angle_std]),
+        places=places,
+        places_mm=there.reshape(count, 3),
+        places_std_mm=there_std.reshape(count, 3),
+        lengths_mm=torch.stack([lengths, lengths_std], dim=1),
         fragments=fragments.names,
     )
 

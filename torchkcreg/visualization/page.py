@@ -43,6 +43,8 @@ class Page:
         verdict: "ok", "doubtful" or "failed"; None without a verdict.
         summary: A sentence beside the verdict.
         warnings: Warnings to read before trusting the numbers.
+        answer: Sentences that answer the question, above all else.
+        tiles: The most important numbers: name, value, and a line of explanation.
         rows: Rows of the table.
         scene: Data of the 3D view, see `implant_scene`; None for no 3D view.
         layers: For each view a label, a PNG of the measured view, and a PNG of it with the implant. The page compares
@@ -56,6 +58,8 @@ class Page:
     verdict: str | None = None
     summary: str = ""
     warnings: Sequence[str] = ()
+    answer: Sequence[str] = ()
+    tiles: Sequence[tuple[str, str, str]] = ()
     rows: Sequence[Row] = ()
     scene: dict[str, Any] | None = None
     layers: Sequence[tuple[str, bytes, bytes]] = ()
@@ -77,6 +81,8 @@ def page_html(page: Page) -> str:
         raise ValueError(f"verdict must be one of {', '.join(VERDICTS)}, got {page.verdict!r}")
     parts = [
         f"<h1>{escape(page.title)}</h1>",
+        _answer(page.answer),
+        _tiles(page.tiles),
         _verdict(page),
         _table(page.rows),
         _layers(page.layers),
@@ -107,6 +113,19 @@ def _verdict(page: Page) -> str:
     reasons = "".join(f"<li>{escape(text)}</li>" for text in page.warnings)
     listed = f"<ul>{reasons}</ul>" if reasons else ""
     return f'<div class="verdict {page.verdict or ""}">{word}{escape(page.summary)}{listed}</div>'
+
+
+def _answer(sentences: Sequence[str]) -> str:
+    shown = "".join(f"<p>{escape(text)}</p>" for text in sentences)
+    return f'<section class="answer">{shown}</section>' if shown else ""
+
+
+def _tiles(tiles: Sequence[tuple[str, str, str]]) -> str:
+    shown = "".join(
+        f'<div class="tile">{escape(name)}<b>{escape(value)}</b><small>{escape(about)}</small></div>'
+        for name, value, about in tiles
+    )
+    return f'<div class="tiles">{shown}</div>' if shown else ""
 
 
 def _table(rows: Sequence[Row]) -> str:

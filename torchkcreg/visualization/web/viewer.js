@@ -42,17 +42,34 @@ for (const box of document.querySelectorAll(".viewer")) {
     const times = Number(field("times").value), values = scene[field("value").value];
     const top = Math.max(1e-9, ...values);
     box.querySelector("output").textContent = times + " x";
+    const at = (p, moved, i) => [0, 1, 2].map(k => p[3 * i + k] + (times - 1) * moved[3 * i + k]);
     const drawn = [];
     for (let i = 0; i < n; i++) {
-      const p = [0, 1, 2].map(k => scene.points[3 * i + k] + (times - 1) * scene.moved[3 * i + k]);
-      drawn.push([...place(p), i]);
+      drawn.push([...place(at(scene.points, scene.moved, i)), i]);
     }
     drawn.sort((a, b) => b[2] - a[2]);
     const size = Math.max(1.5, scale * scene.pitch);
+    if (scene.ghost) { // the undeformed implant, in grey
+      pen.fillStyle = "rgba(150,160,175,0.25)";
+      for (let i = 0; i < n; i++) {
+        const [x, y] = place([0, 1, 2].map(k => scene.points[3 * i + k] - scene.moved[3 * i + k]));
+        pen.fillRect(x - size / 2, y - size / 2, size, size);
+      }
+    }
+    if (scene.lines) { // ends of the screws
+      pen.strokeStyle = "rgba(230,159,0,0.9)"; pen.lineWidth = Math.max(2, 2.5 * scale);
+      for (let i = 0; i + 1 < scene.lines.length / 3; i += 2) {
+        const [a, b] = [i, i + 1].map(j => place(at(scene.lines, scene.linesMoved, j)));
+        pen.beginPath(); pen.moveTo(a[0], a[1]); pen.lineTo(b[0], b[1]); pen.stroke();
+      }
+    }
     for (const [x, y, , i] of drawn) { pen.fillStyle = colour(values[i] / top); pen.fillRect(x - size / 2, y - size / 2, size, size); }
     const bar = Math.min(160, width / 3);
     for (let i = 0; i < bar; i++) { pen.fillStyle = colour(i / bar); pen.fillRect(12 + i, height - 22, 1.5, 8); }
     pen.fillStyle = "#dfe6ee"; pen.font = "12px system-ui, sans-serif";
+    const nice = [1, 2, 5, 10, 20, 50, 100].filter(mm => mm * scale < width / 4).pop() || 1;
+    pen.fillRect(width - 12 - nice * scale, height - 18, nice * scale, 2);
+    pen.fillText(nice + " mm", width - 12 - nice * scale, height - 26);
     pen.fillText("0", 12, height - 26); pen.fillText(top.toPrecision(3) + " mm", 12 + bar - 40, height - 26);
   }
   canvas.addEventListener("pointerdown", e => { pointers.set(e.pointerId, [e.clientX, e.clientY]); canvas.setPointerCapture(e.pointerId); });

@@ -1,0 +1,295 @@
+"""Assess a visit: from the scans without and under load to the motion of the fracture and the load on the implant."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchkcreg.evaluation import (
+    Fragments,
+    bone_places,
+    fragments_of,
+    relative_motion,
+)
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.io import read_geometry, read_mesh, read_run, write_components, write_figure, write_json
+from torchkcreg.io.runs import CONFIG, DEFORMATION
+from torchkcreg.physics import is_elastic, material
+from torchkcreg.plain import first_line, plain
+from torchkcreg.registration import RegisteredImplant, RegistrationResult
+from torchkcreg.search import spread_views
+from torchkcreg.visualization import comparison_figure
+
+from .assessment import Assessment, LoadedConfiguration, load_at
+from .load import load_files
+from .register import register_files
+from .register_inputs import RegistrationFiles
+from .visit_page import ASSESSMENT, write_visit_page
+
+_PITCH_MM = 1.0
+_MOST_VIEWS = 12  # of a scan: more take longer than the answer gains
+_FEW = 15  # views; of a scan with more, some are chosen
+
+
+@dataclass(frozen=True)
+class VisitFiles:
+    """Input files of a visit.
+
+    Attributes:
+        implant: Closed mesh of the undeformed implant, mm.
+        material: Name of its material.
+        geometry: Projection matrices, the same for all scans.
+        unloaded: Projections without load.
+        loaded: Projections under load, one file each.
+        loads: Load of each loaded scan, N; empty if unknown.
+        screws: Screws, if they are known.
+        spectrum: Detected spectrum, if it is known.
+        views: Views to register with; None for all of up to 15, or of more the 12 that lie furthest apart.
+        open_beam: Unattenuated intensity, if the files do not give it.
+        at: Point in the implant's frame whose translation is wanted, mm.
+    """
+
+    implant: Path
+    material: str
+    geometry: Path
+    unloaded: Path
+    loaded: Sequence[Path]
+    loads: Sequence[float] = ()
+    screws: Path | None = None
+    spectrum: Path | None = None
+    views: list[int] | None = None
+    open_beam: float | None = None
+    at: Sequence[float] | None = None
+
+    def names(self) -> list[str]:
+        """Names of the configurations, those of the files: first the unloaded one.
+
+        Raises:
+            ValueError: If two files have the same name.
+        """
+        names = [path.stem if path.is_file() else path.name for path in (self.unloaded, *self.loaded)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(
+                f"scans are named after their files, but {twice[0]} is there {names.count(twice[0])} times"
+            )
+        return names
+
+    def check(self) -> None:
+        """Raise ValueError for inputs that contradict each other, before anything is computed."""
+        if not self.loaded:
+            raise ValueError("there is nothing to compare with: name a scan under load, or several")
+        self.names()
+        material(self.material)
+        if self.loads and len(self.loads) != len(self.loaded):
+            raise ValueError(f"{len(self.loaded)} loaded scans need as many loads, got {len(self.loads)}")
+        if not all(math.isfinite(load) and load > 0 for load in self.loads):
+            given = ", ".join(f"{load:g}" for load in self.loads)
+            raise ValueError(f"loads must be above 0 N, got {given}")
+        if self.at is not None and (len(self.at) != 3 or not all(math.isfinite(x) for x in self.at)):
+            raise ValueError("a point has three finite coordinates, mm")
+
+
+def assess_files(
+    files: VisitFiles,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    figures: bool = True,
+) -> Assessment:
+    """Measure how a fracture moves under load and what its implant carries; write a run folder a scan and the answer.
+
+    The unloaded scan is registered first, searched from nowhere if need be. The scans under load start from it. If the
+    alloy's stiffness is known, they are bent from its shape by loads at the holes (finite elements). A scan under load
+    that cannot be registered is listed with its reason and does not stop the others.
+
+    Args:
+        files: Input files.
+        out: Output folder: a run folder of its file's name for each scan, and `assess.json`.
+        overwrite: Replace existing runs in the folder.
+        resume: Continue an interrupted assessment; finished registrations are kept.
+        figures: Draw figures and write reports.
+
+    Raises:
+        ValueError: If files contradict each other, or the unloaded scan cannot be registered.
+        FileNotFoundError: If a file is missing.
+        FileExistsError: If `out` holds runs and neither overwrite nor resume is set.
+    """
+    files.check()
+    names = files.names()
+    if not (overwrite or resume):
+        for name in names:
+            if (out / name / CONFIG).exists():
+                raise FileExistsError(f"folder {out / name} holds a run already: --overwrite or --resume it")
+    work = _Work(files, out, overwrite=overwrite, resume=resume, figures=figures)
+    unloaded = work.register(files.unloaded, names[0])
+    if unloaded.status == "failed":
+        raise ValueError(
+            f"the unloaded scan was not registered, so nothing can be compared with it: {'; '.join(unloaded.warnings)}"
+        )
+    first = unloaded.implants[0]
+    screws = work.screws_of(first)
+    start = out / names[0]
+    results = [work.tried(path, n, start, screws) for path, n in zip(files.loaded, names[1:], strict=True)]
+    visit = _Visit.of(files, first)
+    loads: Sequence[float | None] = files.loads or [None] * len(results)
+    configurations = tuple(
+        visit.configuration(name, load, result, work)
+        for name, load, result in zip(names[1:], loads, results, strict=True)
+    )
+    doubts = [f"{names[0]} is {unloaded.status}: {why}" for why in unloaded.warnings if unloaded.status != "ok"]
+    assumed = (*work.assumed, *visit.assumed)
+    assessment = Assessment(names[0], configurations, assumed, (*doubts, *visit.doubts), tuple(work.commands), out)
+    write_json(out / ASSESSMENT, plain(assessment.to_dict()))
+    if figures:
+        measured = [c for c in configurations if c.motion is not None]
+        if measured:
+            motions, labels = [c.motion for c in measured if c.motion is not None], [c.name for c in measured]
+            figure = comparison_figure(motions, labels, [c.load_n for c in measured if c.load_n is not None])
+            write_figure(out / "motion.png", figure)
+        write_visit_page(out)
+    return assessment
+
+
+class _Work:
+    """Registrations of a visit, their commands, and what they assume."""
+
+    def __init__(self, files: VisitFiles, out: Path, *, overwrite: bool, resume: bool, figures: bool) -> None:
+        self.files, self.out, self.overwrite, self.resume, self.figures = files, out, overwrite, resume, figures
+        self.views = files.views
+        self.assumed: list[str] = []
+        self.commands: list[str] = []
+        if files.views is None:
+            geometry = read_geometry(files.geometry, projections=files.unloaded)
+            if geometry.num_views > _FEW:
+                self.views = spread_views(geometry, _MOST_VIEWS, opposite=True)
+                chosen = ", ".join(map(str, self.views))
+                self.assumed.append(
+                    f"{_MOST_VIEWS} of {geometry.num_views} views, spread over all directions: {chosen}"
+                )
+        if files.screws is None:
+            self.assumed.append("screws are not known: they are searched for in the implant's holes")
+        if files.spectrum is None:
+            self.assumed.append("the spectrum is not known: that of a 90 kV tungsten tube, hardened as the images ask")
+        self.elastic = is_elastic(files.material)
+        if not self.elastic:
+            self.assumed.append(f"the stiffness of {files.material} is not known: motion is measured, loads are not")
+
+    def register(
+        self, projections: Path, name: str, *, start: Path | None = None, screws: Path | None = None
+    ) -> RegistrationResult:
+        """Register a scan, or read it if it was registered before an interruption."""
+        elastic = self.elastic and start is not None
+        inputs = RegistrationFiles(
+            implant=self.files.implant,
+            geometry=self.files.geometry,
+            projections=projections,
+            spectrum=self.files.spectrum,
+            components=screws or self.files.screws,
+            init=start,
+            rest=start if elastic else None,
+            views=self.views,
+            open_beam=self.files.open_beam,
+        )
+        options = {"material": self.files.material, "deformation": "fe" if elastic else "modes"}
+        folder = self.out / name
+        self.commands.append(_command(inputs, folder, options))
+        if self.resume and (folder / DEFORMATION).exists():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return read_run(folder)
+        going_on = self.resume and (folder / CONFIG).exists()
+        return register_files(
+            inputs, folder, overrides=options, overwrite=self.overwrite, resume=going_on, figures=self.figures
+        )
+
+    def tried(self, projections: Path, name: str, start: Path, screws: Path | None) -> RegistrationResult | str:
+        """Register a scan under load; or why it cannot be."""
+        try:
+            return self.register(projections, name, start=start, screws=screws)
+        except (ValueError, OSError, RuntimeError) as error:
+            warnings.warn(f"scan {name} was not registered: {first_line(error)}", stacklevel=3)
+            return first_line(error)
+
+    def screws_of(self, implant: RegisteredImplant) -> Path | None:
+        """File of the screws for the scans under load: those given, or those found without load; None without any."""
+        if self.files.screws is not None or not implant.screws:
+            return self.files.screws
+        path = self.out / "screws.json"
+        write_components(path, implant.screws)
+        self.assumed.append(f"{len(implant.screws)} screws as found in the unloaded scan")
+        return path
+
+
+@dataclass(frozen=True, eq=False)
+class _Visit:
+    """What all configurations are compared with."""
+
+    files: VisitFiles
+    first: RegisteredImplant
+    cloud: ImplantPointCloud
+    fragments: Fragments
+    places: Tensor
+    place: str
+    assumed: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+    @classmethod
+    def of(cls, files: VisitFiles, first: RegisteredImplant) -> _Visit:
+        cloud = ImplantPointCloud.from_mesh(read_mesh(files.implant), _PITCH_MM, dtype=torch.float64)
+        assumed, doubts = [], []
+        try:
+            fragments = fragments_of(cloud.points, first.screws, radius_mm=first.follow_radius_mm)
+        except ValueError as error:
+            fragments = fragments_of(cloud.points, [])
+            doubts.append(f"{error}; the ends of the implant stand for the fragments instead")
+        if not first.screws:
+            doubts.append("no screws show what is fixed to which fragment: the ends of the implant are used instead")
+        place = "gap" if files.at is None else "point asked for"
+        at = fragments.gap if files.at is None else torch.tensor(list(files.at), dtype=torch.float64)
+        places = at[None]
+        if first.screws:
+            places = torch.cat([places, bone_places(cloud.points, first.screws, fragments.gap)])
+            assumed.append("the bone lies along the screws: its axis half-way between the implant and their tips")
+        return cls(files, first, cloud, fragments, places, place, tuple(assumed), tuple(doubts))
+
+    def configuration(
+        self, name: str, load: float | None, result: RegistrationResult | str, work: _Work
+    ) -> LoadedConfiguration:
+        """The numbers of a scan under load, or why there are none."""
+        if isinstance(result, str):
+            return LoadedConfiguration(name, "failed", (result,), load)
+        if result.status == "failed":
+            return LoadedConfiguration(name, "failed", tuple(result.warnings), load)
+        implant = result.implants[0]
+        motion = relative_motion(self.first, implant, self.cloud, self.fragments, places=self.places)
+        carried = gap_load = None
+        reasons = list(result.warnings)
+        if work.elastic:
+            folder = work.out / name
+            carried = load_files(folder, folder / "load", implant=self.files.implant, figures=work.figures)
+            gap_load = load_at(carried.carried, self.places[0], motion, self.first, self.cloud)
+            reasons += [text for text in carried.warnings if not text.startswith("the registration is")]
+        return LoadedConfiguration(name, result.status, tuple(reasons), load, motion, self.place, carried, gap_load)
+
+
+def _command(files: RegistrationFiles, folder: Path, options: dict[str, Any]) -> str:
+    """The `register` command of a step."""
+    words = ["torchkcreg", "register"]
+    names = ("implant", "geometry", "projections", "spectrum", "components", "init", "rest", "open_beam")
+    for name in names:
+        if (value := getattr(files, name)) is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    if isinstance(files.views, list):
+        words += ["--views", ",".join(map(str, files.views))]
+    for name, value in options.items():
+        words += [f"--{name}", str(value)]
+    return shlex.join([*words, "--out", str(folder)])
