@@ -524,15 +524,15 @@ def read_run_quietly(folder):
 def test_views_are_lists_ranges_and_slices() -> None:
     from argparse import ArgumentTypeError
 
-    from torchkcreg.cli.register import _views
+    from torchkcreg.cli.register import views_of
 
-    assert _views("15,16,17") == [15, 16, 17]
-    assert _views("4-7,0:20:5,9") == [4, 5, 6, 7, 0, 5, 10, 15, 9]
-    assert _views("2:4") == [2, 3]
-    assert (_views("all"), _views("auto")) == ("all", "auto")
+    assert views_of("15,16,17") == [15, 16, 17]
+    assert views_of("4-7,0:20:5,9") == [4, 5, 6, 7, 0, 5, 10, 15, 9]
+    assert views_of("2:4") == [2, 3]
+    assert (views_of("all"), views_of("auto")) == ("all", "auto")
     for wrong in ("", "a", "4-", "7-4", "0:5:0", "1;2"):
         with pytest.raises(ArgumentTypeError, match="views must be such as"):
-            _views(wrong)
+            views_of(wrong)
 
 
 def test_of_many_views_those_that_lie_far_apart_are_used(tmp_path) -> None:

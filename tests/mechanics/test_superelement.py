@@ -10,7 +10,18 @@ import trimesh
 
 from torchkcreg.deformation import FiniteElementDeformation, Level, deformation_from_dict
 from torchkcreg.implant import ImplantPointCloud, find_holes
-from torchkcreg.mechanics import ElasticBody, ExpectedLoads, Hold, LoadPrior, Superelement, holds_of, shares_of_holds
+from torchkcreg.mechanics import (
+    ElasticBody,
+    ExpectedLoads,
+    Hold,
+    LoadPrior,
+    Superelement,
+    fragment_loads,
+    hold_motions,
+    holds_of,
+    shares_of_holds,
+    sides_of_holds,
+)
 from torchkcreg.mechanics.holds import unit_loads
 from torchkcreg.physics import elastic_constants
 from torchkcreg.plain import plain
@@ -205,3 +216,50 @@ def test_ways_to_bend_do_not_depend_on_the_sign_of_eigenvectors(bar, element, mo
     other = Superelement.of(bar, STEEL, HOLDS)
     torch.testing.assert_close(other.loads, element.loads, rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(other.nodal, element.nodal, rtol=1e-5, atol=1e-7)
+
+
+def test_the_energy_is_the_work_of_the_loads_on_their_holds(element) -> None:
+    energy = element.energy
+    assert energy is not None
+    moved = hold_motions(element.hexahedra, element.nodal, element.holds)
+    work = torch.einsum("ahk,bhk->ab", element.loads, moved)
+    count = element.num_amounts
+    torch.testing.assert_close(energy[:count, :count], work, rtol=0.02, atol=0.02 * float(work.abs().max()))
+    assert float(torch.linalg.eigvalsh(energy).min()) > 0
+
+
+def test_loads_between_fragments_have_their_resultant_and_the_least_energy(element) -> None:
+    loads = torch.cat([element.loads, element.stiff])
+    sides = torch.tensor([-1, 0, 1, 1])
+    scale = loads.new_tensor([200.0] * 3 + [1500.0] * 3)
+    amounts = fragment_loads(loads, element.energy, element.centers, sides, scale)
+    acting = torch.einsum("qa,ahk->qhk", amounts, loads)
+    assert float(acting[:, 1].abs().max()) < 1e-6  # no fragment, no load
+    middle = (element.centers[2:].mean(0) + element.centers[0]) / 2
+    arms = (element.centers[2:] - middle).expand(6, -1, 3)
+    moments = acting[:, 2:, 3:] + torch.linalg.cross(arms, acting[:, 2:, :3])
+    through = torch.cat([acting[:, 2:, :3].sum(1), moments.sum(1)], dim=1)
+    torch.testing.assert_close(through, torch.eye(6).double(), rtol=0, atol=1e-6)
+    bending = float(amounts[3] @ element.energy @ amounts[3])
+    # a moment that enters at the outer hold bends the stretch between both upper holds as well
+    outer = fragment_loads(loads, element.energy, element.centers, torch.tensor([-1, 0, 0, 1]), scale)
+    assert bending < 0.9 * float(outer[3] @ element.energy @ outer[3])
+
+
+def test_between_fragments_large_loads_are_expected_at_the_screws_beside_the_gap(element) -> None:
+    sides = torch.tensor([-1, -1, 1, 1])
+    plain_prior, wide = ExpectedLoads.of(element), ExpectedLoads.of(element, sides=sides)
+    extra = torch.linalg.eigvalsh(wide.covariance - plain_prior.covariance)
+    assert float(extra.min()) > -1e-9 * float(extra.max()) and float(extra.max()) > 0  # wider, never narrower
+    loads = torch.einsum("ab,ahk->bhk", torch.linalg.cholesky(wide.covariance), wide.loads_of(element))
+    moments = loads[..., 3:].square().sum(0).sum(-1).sqrt()
+    assert float(moments[1:3].min()) > 1.5 * float(moments[[0, 3]].max())
+    again = ExpectedLoads.of(element, sides=torch.zeros(4, dtype=torch.long))
+    torch.testing.assert_close(again.precision, plain_prior.precision)
+
+
+def test_holds_belong_to_the_fragment_on_their_side_of_the_widest_gap(element) -> None:
+    axis = element.sections.axis
+    sign = int(torch.sign(axis[2]))
+    assert (sign * sides_of_holds(element.centers, axis, [0, 2, 3])).tolist() == [-1, 0, 1, 1]
+    assert sides_of_holds(element.centers, axis, [2]).tolist() == [0, 0, 0, 0]

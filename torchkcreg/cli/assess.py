@@ -29,6 +29,7 @@ def add_assess(commands) -> None:
     command.add_argument("--open-beam", type=float, help="unattenuated intensity, if the files do not give it")
     at = "point in the implant's frame whose translation leads, mm (default: the middle of the fracture in the implant)"
     command.add_argument("--at", type=float, nargs=3, metavar=("X", "Y", "Z"), help=at)
+    command.add_argument("--config", type=Path, help="options of the registrations as YAML or JSON")
     command.add_argument("--out", type=Path, required=True, help="output folder")
     command.add_argument("--no-volumes", action="store_true", help="do not reconstruct volumes")
     command.add_argument("--no-figures", action="store_true", help="do not draw figures")
@@ -50,7 +51,7 @@ def _assess(options: argparse.Namespace) -> Answer:
     from torchkcreg.commands import VisitFiles, assess_files
 
     names = ("implant", "material", "geometry", "unloaded", "loaded", "loads", "screws", "spectrum", "views")
-    files = VisitFiles(**{name: getattr(options, name) for name in (*names, "open_beam", "at")})
+    files = VisitFiles(**{name: getattr(options, name) for name in (*names, "open_beam", "at", "config")})
     assessment = assess_files(
         files, options.out, overwrite=options.overwrite, resume=options.resume, figures=not options.no_figures
     )

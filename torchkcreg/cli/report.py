@@ -19,7 +19,8 @@ def add_report(commands) -> None:
 
 
 def _report(options: argparse.Namespace) -> Answer:
-    from torchkcreg.commands import write_report
+    from torchkcreg.commands import ASSESSMENT, write_report, write_visit_page
 
-    page = write_report(options.folder, out=options.out)
+    write = write_visit_page if (options.folder / ASSESSMENT).is_file() else write_report
+    page = write(options.folder, out=options.out)
     return Answer(str(page), {"page": page})

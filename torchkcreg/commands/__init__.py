@@ -19,9 +19,11 @@ from .register_frames import FrameSeries, register_frames
 from .report import write_report
 from .seeds import SeedRuns, register_seeds
 from .simulate import SimulatedFiles, simulate_files
+from .visit_page import ASSESSMENT, write_visit_page
 from .warp import warp_files
 
 __all__ = [
+    "ASSESSMENT",
     "Assessment",
     "Comparison",
     "FileEvaluation",
@@ -59,4 +61,5 @@ __all__ = [
     "simulate_files",
     "warp_files",
     "write_report",
+    "write_visit_page",
 ]

@@ -55,6 +55,7 @@ class VisitFiles:
         views: Views to register with; None for all of up to 15, or of more the 12 that lie furthest apart.
         open_beam: Unattenuated intensity, if the files do not give it.
         at: Point in the implant's frame whose translation is wanted, mm.
+        config: Options of the registrations, as YAML or JSON.
     """
 
     implant: Path
@@ -68,6 +69,7 @@ class VisitFiles:
     views: list[int] | None = None
     open_beam: float | None = None
     at: Sequence[float] | None = None
+    config: Path | None = None
 
     def names(self) -> list[str]:
         """Names of the configurations, those of the files: first the unloaded one.
@@ -198,18 +200,19 @@ class _Work:
             rest=start if elastic else None,
             views=self.views,
             open_beam=self.files.open_beam,
+            config=self.files.config,
         )
         options = {"material": self.files.material, "deformation": "fe" if elastic else "modes"}
         folder = self.out / name
         self.commands.append(_command(inputs, folder, options))
-        if self.resume and (folder / DEFORMATION).exists():
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                return read_run(folder)
-        going_on = self.resume and (folder / CONFIG).exists()
-        return register_files(
-            inputs, folder, overrides=options, overwrite=self.overwrite, resume=going_on, figures=self.figures
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # the answer gives them with the scan's name
+            if not (self.resume and (folder / DEFORMATION).exists()):
+                going_on = self.resume and (folder / CONFIG).exists()
+                register_files(
+                    inputs, folder, overrides=options, overwrite=self.overwrite, resume=going_on, figures=self.figures
+                )
+            return read_run(folder)
 
     def tried(self, projections: Path, name: str, start: Path, screws: Path | None) -> RegistrationResult | str:
         """Register a scan under load; or why it cannot be."""
@@ -231,7 +234,7 @@ class _Work:
 
 @dataclass(frozen=True, eq=False)
 class _Visit:
-    """What all configurations are compared with."""
+    """The unloaded implant, its fragments and places, with which all scans under load are compared."""
 
     files: VisitFiles
     first: RegisteredImplant
@@ -272,10 +275,12 @@ class _Visit:
         implant = result.implants[0]
         motion = relative_motion(self.first, implant, self.cloud, self.fragments, places=self.places)
         carried = gap_load = None
-        reasons = list(result.warnings)
+        reasons = [text for text in result.warnings if not text.startswith("the registration in ")]  # the unloaded one
         if work.elastic:
             folder = work.out / name
-            carried = load_files(folder, folder / "load", implant=self.files.implant, figures=work.figures)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # the same doubts again
+                carried = load_files(folder, folder / "load", implant=self.files.implant, figures=work.figures)
             gap_load = load_at(carried.carried, self.places[0], motion, self.first, self.cloud)
             reasons += [text for text in carried.warnings if not text.startswith("the registration is")]
         return LoadedConfiguration(name, result.status, tuple(reasons), load, motion, self.place, carried, gap_load)
@@ -284,7 +289,7 @@ class _Visit:
 def _command(files: RegistrationFiles, folder: Path, options: dict[str, Any]) -> str:
     """The `register` command of a step."""
     words = ["torchkcreg", "register"]
-    names = ("implant", "geometry", "projections", "spectrum", "components", "init", "rest", "open_beam")
+    names = ("implant", "geometry", "projections", "spectrum", "components", "init", "rest", "open_beam", "config")
     for name in names:
         if (value := getattr(files, name)) is not None:
             words += [f"--{name.replace('_', '-')}", str(value)]

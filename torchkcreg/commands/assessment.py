@@ -116,12 +116,13 @@ class LoadedConfiguration:
         else:
             length, std = self.motion.lengths_mm[0].tolist()
             parts.append(f"it moves by {_pm(length, std)} mm at the {self.place}")
-        if self.gap_load is not None:
+        if self.gap_load is not None and self.carried is not None:
             value, std = _length(*(part[3:] for part in self.gap_load))
-            parts.append(f"the implant carries {_pm(value / 1000, std / 1000)} N m across it")
-        if self.carried is not None:
-            share, std = self.stress_share
-            parts.append(f"and reaches {_pm(100 * share, 100 * std)} % of its yield stress")
+            share, share_std = self.stress_share
+            parts.append(
+                f"the implant carries {_pm(value / 1000, std / 1000)} N m across it and reaches "
+                f"{_pm(100 * share, 100 * share_std)} % of its yield stress"
+            )
         return "; ".join(parts) + "."
 
 
@@ -158,6 +159,7 @@ class Assessment:
 
     def __str__(self) -> str:
         lines = [f"{c.sentence()} ({c.status})" for c in self.configurations]
+        lines += [f"doubt: {c.name}: {reason}" for c in self.configurations for reason in c.reasons]
         lines += [f"assumed: {text}" for text in self.assumed]
         return "\n".join([*lines, *(f"doubt: {text}" for text in self.warnings), f"folder {self.folder}"])
 

@@ -68,7 +68,7 @@ def write_report(folder: Path, *, out: Path | None = None) -> Path:
     if not folder.is_dir():
         raise FileNotFoundError(f"folder {folder} does not exist")
     metrics = _read(folder / "metrics.json")
-    pictures = [(NAMES.get(path.name, path.stem), path.read_bytes()) for path in _pictures(folder)]
+    pictures = [picture_of(path, NAMES.get(path.name, path.stem)) for path in _pictures(folder)]
     tables = {path.name: read_json(path, "table") for path in sorted(folder.glob("*.json")) if path.name in TABLES}
     is_run = (folder / "deformation.json").is_file()
     if not metrics and not tables and not is_run:
@@ -109,6 +109,11 @@ def _kind(folder: Path) -> str:
 def _read(path: Path) -> dict[str, Any]:
     content = read_json(path, path.stem) if path.is_file() else {}
     return content if isinstance(content, dict) else {}
+
+
+def picture_of(path: Path, title: str) -> tuple[str, bytes]:
+    """A picture for a page: its title and content."""
+    return title, path.read_bytes()
 
 
 def _pictures(folder: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import REPORT, mesh_of_run, read_json, read_mesh, read_run, write_text
 from torchkcreg.visualization import Page, Row, page_html
 
-from .report import implant_scene, layers_of
+from .report import implant_scene, layers_of, picture_of
 
 ASSESSMENT = "assess.json"
 _PITCH_MM = 1.5
@@ -24,8 +24,8 @@ _FIGURES = {
 }
 
 
-def write_visit_page(folder: Path) -> Path:
-    """Write `report.html` of a folder of `torchkcreg assess` and return its path.
+def write_visit_page(folder: Path, *, out: Path | None = None) -> Path:
+    """Write the page of a folder of `torchkcreg assess`, by default its `report.html`, and return its path.
 
     Raises:
         FileNotFoundError: If the folder has no `assess.json`.
@@ -61,8 +61,9 @@ def write_visit_page(folder: Path) -> Path:
         )
     except (KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{folder / ASSESSMENT} is damaged: {error!r}") from None
-    write_text(folder / REPORT, page_html(page))
-    return folder / REPORT
+    target = out or folder / REPORT
+    write_text(target, page_html(page))
+    return target
 
 
 def _pm(value: float, std: float | None, unit: str, form: str = "{:.2f}") -> str:
@@ -142,5 +143,5 @@ def _pictures(folder: Path, names: list[str]) -> list[tuple[str, bytes]]:
         for path in [folder / name] if "/" not in name else [folder / c / name for c in names]:
             if path.is_file():
                 where = "" if path.parent == folder else f": {path.parent.parent.name}"
-                pictures.append((f"{title}{where}", path.read_bytes()))
+                pictures.append(picture_of(path, f"{title}{where}"))
     return pictures

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics import ExpectedLoads, Hold, Superelement, shares_of_holds
+from torchkcreg.mechanics import ExpectedLoads, Hold, Superelement, shares_of_holds, sides_of_holds, used_holds
 from torchkcreg.mechanics.holds import rigid_fields
 
 from .deformation import Deformation, Level, Motion
@@ -81,6 +81,7 @@ class FiniteElementDeformation(Deformation):
         weighed: If True, a registration estimates `load_weight` from the disagreement between its images.
         unused: Expected strength of loads at holds without a screw relative to holds with one, if screws are known.
         shares: Relative strength (H,) of the loads at each hold; all one if None.
+        sides: Bone fragment of each hold (H,), -1, +1 or 0 for none, see `sides_of_holds`; all 0 if None.
         covariance: Covariance (A, A) of the amounts, mm^2, if a registration has estimated it.
         rest: Fixed deformation from the undeformed implant to its unloaded shape, which is the superelement's shape.
             If None, the unloaded shape is the undeformed implant.
@@ -103,6 +104,7 @@ class FiniteElementDeformation(Deformation):
         weighed: bool = False,
         unused: float = 1.0,
         shares: Tensor | None = None,
+        sides: Tensor | None = None,
         covariance: Tensor | None = None,
         rest: Deformation | None = None,
         rest_spread: Tensor | None = None,
@@ -114,7 +116,12 @@ class FiniteElementDeformation(Deformation):
         weight = torch.tensor(load_weight, dtype=torch.float64, device=superelement.expected.device)
         self.register_buffer("weight", weight)  # a buffer, so that checkpoints keep an estimated weight
         self.shares = superelement.expected.new_ones(len(superelement.holds)) if shares is None else shares
-        self.expected = ExpectedLoads.of(superelement, self.shares)
+        self.sides = (
+            torch.zeros(len(superelement.holds), dtype=torch.long, device="cpu")
+            if sides is None
+            else sides.long().cpu()
+        )
+        self.expected = ExpectedLoads.of(superelement, self.shares, self.sides)
         start = torch.zeros_like(superelement.expected) if amounts is None else amounts.detach().clone()
         self.amounts = nn.Parameter(start.to(superelement.expected))
 
@@ -123,7 +130,7 @@ class FiniteElementDeformation(Deformation):
         self.amounts.data, self.weight = self.amounts.data.double(), self.weight.double()
         self.superelement = self.superelement.to(self.amounts.device)
         self.shares = self.shares.to(self.amounts.device)
-        self.expected = ExpectedLoads.of(self.superelement, self.shares)
+        self.expected = ExpectedLoads.of(self.superelement, self.shares, self.sides)
         for name in ("covariance", "rest_spread"):
             if (covariance := getattr(self, name)) is not None:
                 setattr(self, name, covariance.to(self.amounts.device))
@@ -163,9 +170,15 @@ class FiniteElementDeformation(Deformation):
         return whole if self.rest is None else whole @ torch.linalg.inv(self.rest.jacobian(points))
 
     def fixed_at(self, heads: Tensor) -> None:
-        """Lower the loads expected at holds without a screw, see `torchkcreg.mechanics.shares_of_holds`."""
-        self.shares = shares_of_holds(self.superelement, self.rested(heads), self.unused)
-        self.expected = ExpectedLoads.of(self.superelement, self.shares)
+        """Expect lower loads at holds without a screw, and those between the fragments next to the gap.
+
+        See `torchkcreg.mechanics.shares_of_holds` and `sides_of_holds`.
+        """
+        heads = self.rested(heads)
+        self.shares = shares_of_holds(self.superelement, heads, self.unused)
+        element = self.superelement
+        self.sides = sides_of_holds(element.centers, element.sections.axis, used_holds(element, heads))
+        self.expected = ExpectedLoads.of(self.superelement, self.shares, self.sides)
 
     def outside(self, points: Tensor) -> Tensor:
         """True for points (..., 3) well beyond the implant's ends: there the end sections' motion is extrapolated."""
@@ -201,6 +214,7 @@ class FiniteElementDeformation(Deformation):
             "load_weight": self.load_weight,
             "unused": self.unused,
             "shares": self.shares.cpu(),
+            "sides": self.sides,
             "superelement": self.superelement.to("cpu").to_dict(),
         }
         return content if self.rest is None else content | {"rest": self.rest.to_dict()}

@@ -42,12 +42,14 @@ def _finite_elements(content: dict[str, Any]) -> FiniteElementDeformation:
     require_keys(content, ("superelement", "amounts", "load_weight"), " of a deformation")
     superelement = Superelement.from_dict(content["superelement"])
     number, covariance, shares = superelement.num_amounts, content.get("covariance"), content.get("shares")
+    sides = content.get("sides")
     return FiniteElementDeformation(
         superelement,
         finite_array(content["amounts"], (number,), "amounts"),
         load_weight=float(content["load_weight"]),
         unused=float(content.get("unused", 1.0)),
         shares=None if shares is None else finite_array(shares, (len(superelement.holds),), "shares"),
+        sides=None if sides is None else finite_array(sides, (len(superelement.holds),), "sides"),
         covariance=None if covariance is None else finite_array(covariance, (number, number), "covariance"),
         rest=deformation_from_dict(content["rest"]) if content.get("rest") is not None else None,
     )

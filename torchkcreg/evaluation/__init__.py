@@ -9,11 +9,10 @@ from torchkcreg.geometry import distance_to
 from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
 from .bead_shadows import bead_shadows, track_beads
 from .beads import Beads, find_beads
-from .bone_places import BONE_PLACES, bone_places
 from .densitometry import MineralContent, mineral_content
 from .displacement_map import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
-from .fragments import Fragments, fragments_of
+from .fragments import BONE_PLACES, Fragments, bone_places, fragments_of
 from .frame_motion import FRAME_COLUMNS, FrameMotion, frame_motion
 from .point_errors import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
 from .regions import RegionStatistics, cylinder_region, region_statistics

@@ -5,10 +5,11 @@ from .body import ElasticBody
 from .carried import CarriedLoad, node_stresses
 from .hexahedra import Hexahedra, edge_for
 from .holds import Hold, holds_of
+from .rigid_fragments import fragment_loads, hold_motions, rigid_at, sides_of_holds
 from .sections import Sections
 from .stiffness import stiffness_matrix
 from .stress import von_mises
-from .superelement import ExpectedLoads, LoadPrior, Superelement, shares_of_holds
+from .superelement import ExpectedLoads, LoadPrior, Superelement, shares_of_holds, used_holds
 
 __all__ = [
     "CarriedLoad",
@@ -20,11 +21,16 @@ __all__ = [
     "Sections",
     "Superelement",
     "edge_for",
+    "fragment_loads",
+    "hold_motions",
     "holds_of",
     "node_stresses",
     "num_shells",
+    "rigid_at",
     "separate_bodies",
     "shares_of_holds",
+    "sides_of_holds",
     "stiffness_matrix",
+    "used_holds",
     "von_mises",
 ]

@@ -19,11 +19,15 @@ from torchkcreg.plain import require_keys
 from .body import ElasticBody
 from .hexahedra import Hexahedra, interpolated
 from .holds import Hold, unit_loads
+from .rigid_fragments import fragment_loads
 from .sections import Sections
 from .stress import StressField
 
 _STATIONS = 24
 _NUMBERS = ("filled", "loads", "expected", "stiff", "shifts", "turns")
+# Load between two fragments over that of a hold, standard deviations: 500 N, most of a body's weight, and 15 N m, half
+# of what bends a plate for good.
+_THROUGH_FORCE, _THROUGH_MOMENT = 2.5, 10.0
 _PITCH_MM = 0.5  # node spacing from which the motion of a section is computed
 
 
@@ -62,6 +66,8 @@ class Superelement:
         nodal: Displacements (A, N, 3) of the hexahedra's nodes for an amount of one, mm.
         shifts: Shifts (A, S, 3) of the sections for an amount of one, mm.
         turns: Small rotation vectors (A, S, 3) of the sections for an amount of one, radians.
+        energy: Second derivatives (A + B, A + B) of the elastic energy by the amounts, stiff modes last, N mm; None in
+            files of earlier versions.
     """
 
     hexahedra: Hexahedra
@@ -76,6 +82,7 @@ class Superelement:
     nodal: Tensor
     shifts: Tensor
     turns: Tensor
+    energy: Tensor | None = None
 
     @classmethod
     def of(
@@ -103,7 +110,8 @@ class Superelement:
             raise ValueError(f"an implant that bends is held in two places or more, got {len(holds)}")
         prior = prior or LoadPrior()
         body = ElasticBody(cloud, constants)
-        unit_responses = body.response(*unit_loads(cloud, holds))
+        places, forces = unit_loads(cloud, holds)
+        unit_responses = body.response(places, forces)
         scale = unit_responses.new_tensor([prior.force] * 3 + [prior.moment] * 3).repeat(len(holds))
         balanced = _balanced(holds, scale)  # (6 H - 6, 6 H), orthonormal under the prior
         coarse = cloud.coarsened_to(_PITCH_MM)
@@ -114,6 +122,7 @@ class Superelement:
         values, vectors = torch.linalg.eigh(mapped @ (flat @ flat.T) @ mapped.T)
         values, modes = values.flip(0).clamp_min(0).sqrt(), vectors.flip(1).T @ mapped
         modes = modes * _senses(modes @ moved.flatten(1))
+        work = _work(body, places, forces, unit_responses)
         num_modes = int((values > negligible_mm).sum().clamp_min(1))
         modes, stiff, expected = modes[:num_modes] / values[:num_modes, None], modes[num_modes:], values[:num_modes]
         sections = Sections.along(coarse, _STATIONS)
@@ -131,12 +140,18 @@ class Superelement:
             torch.einsum("al,lni->ani", modes, unit_responses).float().double(),  # single precision, as in files
             shifts,
             turns,
+            torch.cat([modes, stiff]) @ work @ torch.cat([modes, stiff]).T,
         )
 
     @property
     def num_amounts(self) -> int:
         """Number of modes A."""
         return len(self.expected)
+
+    @property
+    def centers(self) -> Tensor:
+        """Centres of the holds (H, 3), mm."""
+        return self.loads.new_tensor([hold.center for hold in self.holds])
 
     def remainder(self, points: Tensor, amounts: Tensor) -> Tensor:
         """Linear displacements (K, P, 3) at points (P, 3) minus the motion of the sections, mm.
@@ -187,6 +202,7 @@ class Superelement:
             "holds": [asdict(hold) for hold in self.holds],
             "sections": {"axis": sections.axis, "heights": sections.heights, "centers": sections.centers},
             **{name: getattr(self, name) for name in _NUMBERS},
+            **({} if self.energy is None else {"energy": self.energy}),
             "nodal": self.nodal.float(),
         }
 
@@ -208,10 +224,21 @@ class Superelement:
                 holds=tuple(Hold(**_with_tuples(hold)) for hold in content["holds"]),
                 sections=Sections(**{name: _numbers(value) for name, value in content["sections"].items()}),
                 nodal=_numbers(content["nodal"]),
+                energy=_numbers(content["energy"]) if "energy" in content else None,
                 **{name: _numbers(content[name]) for name in _NUMBERS},
             )
         except (TypeError, KeyError) as error:
             raise ValueError(f"the superelement is malformed: {error}") from None
+
+
+def _work(body: ElasticBody, places: Sequence[Tensor], forces: Sequence[Tensor], responses: Tensor) -> Tensor:
+    """Work (L, L) of each of L unit loads, forces (P, 3) at places (P, 3), on the responses (L, N, 3) to the others."""
+    rows = []
+    for hold in range(0, len(places), 6):  # the six loads of a hold act at the same places
+        moved = body.displacement(places[hold], responses)
+        rows += [torch.einsum("pi,lpi->l", force, moved) for force in forces[hold : hold + 6]]
+    work = torch.stack(rows)
+    return 0.5 * (work + work.T)
 
 
 def _numbers(value: Any) -> Tensor:
@@ -272,18 +299,31 @@ class ExpectedLoads:
     spread: Tensor
 
     @classmethod
-    def of(cls, element: Superelement, shares: Tensor | None = None) -> ExpectedLoads:
+    def of(cls, element: Superelement, shares: Tensor | None = None, sides: Tensor | None = None) -> ExpectedLoads:
         """Prior of the loads of an implant.
+
+        Screws of a bone fragment move as one rigid body. Most of the load between two fragments goes therefore through
+        the screws next to the gap, far more than screws carry on average. With `sides` the prior is wide for those
+        loads, whatever it expects at single holds.
 
         Args:
             element: Superelement of the implant.
             shares: Strength (H,) of the loads at each hold relative to the superelement's prior; all one if None.
+            sides: Fragment of each hold (H,), see `sides_of_holds`; None or all of one: no fragments.
         """
         num_amounts = element.num_amounts
         scale = element.loads.new_tensor([element.prior.force] * 3 + [element.prior.moment] * 3)
         strengths = scale.expand(len(element.holds), 6) * (1.0 if shares is None else shares.to(scale)[:, None])
         scaled_loads = (torch.cat([element.loads, element.stiff]) / strengths).flatten(1)
         gram = scaled_loads @ scaled_loads.T
+        if sides is not None and element.energy is not None and bool((sides > 0).any()) and bool((sides < 0).any()):
+            loads, centers = torch.cat([element.loads, element.stiff]), element.centers
+            through = scale * scale.new_tensor([_THROUGH_FORCE] * 3 + [_THROUGH_MOMENT] * 3)
+            wide = fragment_loads(loads, element.energy, centers, sides, scale) * through[:, None]
+            weighted = gram @ wide.T  # Woodbury: inverse of gram^-1 + wide^T wide
+            inner = torch.eye(6, dtype=gram.dtype, device=gram.device) + wide @ weighted
+            gram = gram - weighted @ torch.linalg.solve(inner, weighted.T)
+            gram = 0.5 * (gram + gram.T)
         stiff, mixed = gram[num_amounts:, num_amounts:], gram[num_amounts:, :num_amounts]
         spread = torch.linalg.inv(stiff)
         followed = -spread @ mixed
@@ -299,13 +339,18 @@ class ExpectedLoads:
         return torch.linalg.inv(self.precision)
 
 
+def used_holds(element: Superelement, heads: Sequence[Tensor] | Tensor) -> list[int]:
+    """Numbers of the holds nearest to each head (C, 3)."""
+    centers = element.centers
+    return sorted({int((centers - head.to(centers)).norm(dim=-1).argmin()) for head in heads})
+
+
 def shares_of_holds(element: Superelement, heads: Sequence[Tensor] | Tensor, unused: float) -> Tensor:
     """Relative strength (H,) of the loads at each hold: one at the hold nearest to each head (C, 3), else `unused`.
 
     All are one if the heads are at fewer than two holds, since no loads could then be in equilibrium.
     """
-    centers = element.loads.new_tensor([hold.center for hold in element.holds])
-    used = {int((centers - head.to(centers)).norm(dim=-1).argmin()) for head in heads}
+    used, number = used_holds(element, heads), len(element.holds)
     if len(used) < 2:
-        return torch.ones_like(centers[:, 0])
-    return centers.new_tensor([1.0 if hold in used else unused for hold in range(len(centers))])
+        return element.loads.new_ones(number)
+    return element.loads.new_tensor([1.0 if hold in used else unused for hold in range(number)])

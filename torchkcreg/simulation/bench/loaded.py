@@ -14,8 +14,7 @@ from torch import Tensor
 from torchkcreg.deformation import FiniteElementDeformation
 from torchkcreg.geometry import fit_rigid, rigid_matrix, transform_points
 from torchkcreg.implant import ImplantPointCloud, Screw
-from torchkcreg.mechanics import CarriedLoad, Superelement, holds_of, von_mises
-from torchkcreg.mechanics.holds import rigid_fields
+from torchkcreg.mechanics import CarriedLoad, Superelement, hold_motions, holds_of, rigid_at, von_mises
 from torchkcreg.physics import elastic_constants
 from torchkcreg.simulation.hardware import mapped
 from torchkcreg.simulation.loads import Load
@@ -94,7 +93,9 @@ class ElasticConstruct:
         element, number = self.element, self.element.num_amounts
         loads, used = element.loads, sorted(self.sides)
         scale = loads.new_tensor([1.0] * 3 + [_TURN_MM] * 3)
-        held = (hold_motions(element, used) * scale).flatten(1)  # (A, 6 U)
+        held = (hold_motions(element.hexahedra, element.nodal, [element.holds[n] for n in used]) * scale).flatten(
+            1
+        )  # (A, 6 U)
         rigid = held.new_zeros(6 * len(used), 12)
         for row, hold in enumerate(used):
             first = 6 if self.sides[hold] == PROXIMAL else 0
@@ -226,23 +227,3 @@ def _near_motion(vertices: Tensor, moved: Tensor, screw: Screw) -> tuple[Tensor,
 
 def _hold_nodes(element: Superelement, hold: int) -> Tensor:
     return element.holds[hold].nodes(transform_points(element.hexahedra.frame, element.hexahedra.positions))
-
-
-def hold_motions(element: Superelement, holds: list[int]) -> Tensor:
-    """Translation and small rotation (A, U, 6) of holds for a unit amount."""
-    positions = transform_points(element.hexahedra.frame, element.hexahedra.positions)
-    motions = []
-    for hold in holds:
-        near = element.holds[hold].nodes(positions)
-        arms = positions[near] - positions.new_tensor(element.holds[hold].center)
-        fields = rigid_fields(arms)
-        solution = torch.linalg.lstsq(fields.flatten(1).T, element.nodal[:, near].flatten(1).T.to(fields)).solution
-        motions.append(solution.T)
-    return torch.stack(motions, dim=1)
-
-
-def rigid_at(center: Tensor) -> Tensor:
-    """Translation and rotation (6, 6) at a point, for each of the six rigid motions about the origin."""
-    identity = torch.eye(3, dtype=center.dtype, device=center.device)
-    turning = torch.linalg.cross(identity, center.expand(3, 3)).T
-    return torch.cat([torch.cat([identity, turning], dim=1), torch.cat([torch.zeros_like(identity), identity], dim=1)])
