@@ -31,7 +31,8 @@ def add_assess(commands) -> None:
     command.add_argument("--at", type=float, nargs=3, metavar=("X", "Y", "Z"), help=at)
     command.add_argument("--config", type=Path, help="options of the registrations as YAML or JSON")
     command.add_argument("--out", type=Path, required=True, help="output folder")
-    command.add_argument("--no-volumes", action="store_true", help="do not reconstruct volumes")
+    command.add_argument("--no-volumes", action="store_true", help="do not reconstruct the unloaded scan")
+    command.add_argument("--spacing", type=float, default=0.8, help="voxel size of the volumes, mm (default: 0.8)")
     command.add_argument("--no-figures", action="store_true", help="do not draw figures")
     existing = command.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace existing runs in the folder")
@@ -53,7 +54,13 @@ def _assess(options: argparse.Namespace) -> Answer:
     names = ("implant", "material", "geometry", "unloaded", "loaded", "loads", "screws", "spectrum", "views")
     files = VisitFiles(**{name: getattr(options, name) for name in (*names, "open_beam", "at", "config")})
     assessment = assess_files(
-        files, options.out, overwrite=options.overwrite, resume=options.resume, figures=not options.no_figures
+        files,
+        options.out,
+        overwrite=options.overwrite,
+        resume=options.resume,
+        figures=not options.no_figures,
+        volumes=not options.no_volumes,
+        spacing_mm=options.spacing,
     )
     lost = all(c.status == "failed" for c in assessment.configurations)
     return Answer(str(assessment), assessment.to_dict(), FAILED if lost else 0)

@@ -6,7 +6,7 @@ import math
 import shlex
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from .load import load_files
 from .register import register_files
 from .register_inputs import RegistrationFiles
 from .visit_page import ASSESSMENT, write_visit_page
+from .visit_volumes import FEWEST_VIEWS, regions_of, volumes_of
 
 _PITCH_MM = 1.0
 _MOST_VIEWS = 12  # of a scan: more take longer than the answer gains
@@ -106,6 +107,8 @@ def assess_files(
     overwrite: bool = False,
     resume: bool = False,
     figures: bool = True,
+    volumes: bool = True,
+    spacing_mm: float = 0.8,
 ) -> Assessment:
     """Measure how a fracture moves under load and what its implant carries; write a run folder a scan and the answer.
 
@@ -119,6 +122,9 @@ def assess_files(
         overwrite: Replace existing runs in the folder.
         resume: Continue an interrupted assessment; finished registrations are kept.
         figures: Draw figures and write reports.
+        volumes: Reconstruct the unloaded scan by FDK and KC-Rec, after the answer is written, and measure bone mineral
+            in the gap, under the implant and around the screws. Scans of fewer than 60 views give no volumes.
+        spacing_mm: Voxel size of the volumes.
 
     Raises:
         ValueError: If files contradict each other, or the unloaded scan cannot be registered.
@@ -149,16 +155,29 @@ def assess_files(
     )
     doubts = [f"{names[0]} is {unloaded.status}: {why}" for why in unloaded.warnings if unloaded.status != "ok"]
     assumed = (*work.assumed, *visit.assumed)
-    assessment = Assessment(names[0], configurations, assumed, (*doubts, *visit.doubts), tuple(work.commands), out)
-    write_json(out / ASSESSMENT, plain(assessment.to_dict()))
-    if figures:
-        measured = [c for c in configurations if c.motion is not None]
-        if measured:
-            motions, labels = [c.motion for c in measured if c.motion is not None], [c.name for c in measured]
-            figure = comparison_figure(motions, labels, [c.load_n for c in measured if c.load_n is not None])
-            write_figure(out / "motion.png", figure)
-        write_visit_page(out)
+    assessment = Assessment(
+        names[0], configurations, assumed, (*doubts, *visit.doubts), tuple(work.commands), folder=out
+    )
+    _write(assessment, figures)
+    if volumes and visit.regions:
+        mineral, missing = work.volumes(out / names[0], visit.regions, spacing_mm)
+        assessment = replace(assessment, mineral=tuple(mineral), warnings=(*assessment.warnings, *missing))
+        _write(assessment, figures)
     return assessment
+
+
+def _write(assessment: Assessment, figures: bool) -> None:
+    """Write `assess.json` and, with figures, `motion.png` and the page."""
+    out = assessment.folder
+    write_json(out / ASSESSMENT, plain(assessment.to_dict()))
+    if not figures:
+        return
+    measured = [(c.name, c.load_n, c.motion) for c in assessment.configurations if c.motion is not None]
+    if measured:
+        labels, loads, motions = zip(*measured, strict=True)
+        known = [load for load in loads if load is not None]
+        write_figure(out / "motion.png", comparison_figure(motions, labels, known))
+    write_visit_page(out)
 
 
 class _Work:
@@ -169,14 +188,12 @@ class _Work:
         self.views = files.views
         self.assumed: list[str] = []
         self.commands: list[str] = []
-        if files.views is None:
-            geometry = read_geometry(files.geometry, projections=files.unloaded)
-            if geometry.num_views > _FEW:
-                self.views = spread_views(geometry, _MOST_VIEWS, opposite=True)
-                chosen = ", ".join(map(str, self.views))
-                self.assumed.append(
-                    f"{_MOST_VIEWS} of {geometry.num_views} views, spread over all directions: {chosen}"
-                )
+        geometry = read_geometry(files.geometry, projections=files.unloaded)
+        self.num_views = geometry.num_views
+        if files.views is None and geometry.num_views > _FEW:
+            self.views = spread_views(geometry, _MOST_VIEWS, opposite=True)
+            chosen = ", ".join(map(str, self.views))
+            self.assumed.append(f"{_MOST_VIEWS} of {geometry.num_views} views, spread over all directions: {chosen}")
         if files.screws is None:
             self.assumed.append("screws are not known: they are searched for in the implant's holes")
         if files.spectrum is None:
@@ -222,6 +239,23 @@ class _Work:
             warnings.warn(f"scan {name} was not registered: {first_line(error)}", stacklevel=3)
             return first_line(error)
 
+    def volumes(
+        self, run: Path, regions: dict[str, list[float]], spacing_mm: float
+    ) -> tuple[list[dict[str, Any]], list[str]]:
+        """Bone mineral of regions of the unloaded scan, and why something is missing."""
+        if self.num_views < FEWEST_VIEWS:
+            return [], [f"{self.num_views} views are too few for a volume, which takes {FEWEST_VIEWS}"]
+        folder = self.out / "volumes"
+        return volumes_of(
+            run,
+            folder,
+            regions,
+            spacing_mm=spacing_mm,
+            resume=self.resume,
+            overwrite=self.overwrite,
+            figures=self.figures,
+        )
+
     def screws_of(self, implant: RegisteredImplant) -> Path | None:
         """File of the screws for the scans under load: those given, or those found without load; None without any."""
         if self.files.screws is not None or not implant.screws:
@@ -242,6 +276,7 @@ class _Visit:
     fragments: Fragments
     places: Tensor
     place: str
+    regions: dict[str, list[float]]
     assumed: tuple[str, ...]
     doubts: tuple[str, ...]
 
@@ -259,10 +294,14 @@ class _Visit:
         place = "gap" if files.at is None else "point asked for"
         at = fragments.gap if files.at is None else torch.tensor(list(files.at), dtype=torch.float64)
         places = at[None]
+        regions: dict[str, list[float]] = {}
         if first.screws:
-            places = torch.cat([places, bone_places(cloud.points, first.screws, fragments.gap)])
+            bone = bone_places(cloud.points, first.screws, fragments.gap)
+            places = torch.cat([places, bone])
+            axis = first.warp(fragments.upper).mean(0) - first.warp(fragments.lower).mean(0)
+            regions = regions_of(first, cloud.points, bone, axis / axis.norm())
             assumed.append("the bone lies along the screws: its axis half-way between the implant and their tips")
-        return cls(files, first, cloud, fragments, places, place, tuple(assumed), tuple(doubts))
+        return cls(files, first, cloud, fragments, places, place, regions, tuple(assumed), tuple(doubts))
 
     def configuration(
         self, name: str, load: float | None, result: RegistrationResult | str, work: _Work

@@ -136,6 +136,7 @@ class Assessment:
         assumed: What was assumed, a line each.
         warnings: What to doubt, a line each.
         commands: Commands that repeat each step.
+        mineral: Bone mineral of regions of the unloaded scan; empty without volumes.
         folder: Output folder.
     """
 
@@ -144,6 +145,7 @@ class Assessment:
     assumed: tuple[str, ...]
     warnings: tuple[str, ...]
     commands: tuple[str, ...]
+    mineral: tuple[dict[str, Any], ...] = ()
     folder: Path = field(default=Path())
 
     def to_dict(self) -> dict[str, Any]:
@@ -155,11 +157,16 @@ class Assessment:
             "assumed": list(self.assumed),
             "warnings": list(self.warnings),
             "commands": list(self.commands),
+            "mineral": list(self.mineral),
         }
 
     def __str__(self) -> str:
         lines = [f"{c.sentence()} ({c.status})" for c in self.configurations]
         lines += [f"doubt: {c.name}: {reason}" for c in self.configurations for reason in c.reasons]
+        lines += [
+            f"{m['region']}: {m['hydroxyapatite_mg_ml']:.0f} mg/mL of hydroxyapatite in {m['volume_ml']:.2f} mL"
+            for m in self.mineral
+        ]
         lines += [f"assumed: {text}" for text in self.assumed]
         return "\n".join([*lines, *(f"doubt: {text}" for text in self.warnings), f"folder {self.folder}"])
 

@@ -19,6 +19,9 @@ ASSESSMENT = "assess.json"
 _PITCH_MM = 1.5
 _TURNS = ("bending_out_of_plane", "bending_in_plane", "twist")
 _FIGURES = {
+    "volumes/fdk/slices.png": "The unloaded scan by FDK",
+    "volumes/kcrec/slices.png": "The unloaded scan by KC-Rec",
+    "volumes/densitometry/densitometry.png": "Bone mineral, and its regions",
     "motion.png": "Deflection of the implant relative to the lower fragment",
     "load/load.png": "Moments along the implant, and the stress on its surface",
 }
@@ -39,14 +42,14 @@ def write_visit_page(folder: Path, *, out: Path | None = None) -> Path:
         page = Page(
             f"Motion of a fracture: {folder.resolve().name}",
             verdict=worst,
-            answer=content["answer"],
+            answer=[sentence.replace("+-", "±") for sentence in content["answer"]],
             tiles=_tiles(measured[-1]) if measured else (),
             summary="" if worst == "ok" else "Look at these before trusting the numbers.",
             warnings=[
                 *(f"{c['name']}: {reason}" for c in content["configurations"] for reason in c["reasons"]),
                 *content["warnings"],
             ],
-            rows=[row for c in measured for row in _rows(c)],
+            rows=[*(row for c in measured for row in _rows(c)), *map(_mineral_row, content.get("mineral", []))],
             scene=_scene(folder, content["unloaded"], measured[-1]) if measured else None,
             layers=[
                 (f"{c['name']}, {label}", grey, overlay)
@@ -68,7 +71,7 @@ def write_visit_page(folder: Path, *, out: Path | None = None) -> Path:
 
 def _pm(value: float, std: float | None, unit: str, form: str = "{:.2f}") -> str:
     deviation = "" if std is None else f" ± {form.format(std)}"
-    return f"{form.format(value)}{deviation} {unit}"
+    return f"{form.format(value)}{deviation}\N{NO-BREAK SPACE}{unit.replace(' ', chr(0xA0))}"
 
 
 def _tiles(last: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -109,6 +112,11 @@ def _rows(c: dict[str, Any]) -> list[Row]:
     return rows
 
 
+def _mineral_row(m: dict[str, Any]) -> Row:
+    about = f"hydroxyapatite in {m['volume_ml']:.2f} mL; {100 * m['left_out']:.0f} % of the region left out"
+    return Row(f"bone mineral: {m['region']}", f"{m['hydroxyapatite_mg_ml']:.0f} mg/mL", about=about)
+
+
 def _scene(folder: Path, unloaded: str, last: dict[str, Any]) -> dict[str, Any] | None:
     """The implant and its screws under load, relative to the lower fragment; the unloaded implant as a ghost."""
     with warnings.catch_warnings():
@@ -140,8 +148,8 @@ def _scene(folder: Path, unloaded: str, last: dict[str, Any]) -> dict[str, Any] 
 def _pictures(folder: Path, names: list[str]) -> list[tuple[str, bytes]]:
     pictures = []
     for name, title in _FIGURES.items():
-        for path in [folder / name] if "/" not in name else [folder / c / name for c in names]:
+        paths = {"": folder / name} if name[:4] != "load" else {f": {c}": folder / c / name for c in names}
+        for where, path in paths.items():
             if path.is_file():
-                where = "" if path.parent == folder else f": {path.parent.parent.name}"
                 pictures.append(picture_of(path, f"{title}{where}"))
     return pictures

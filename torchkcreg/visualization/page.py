@@ -43,7 +43,7 @@ class Page:
         verdict: "ok", "doubtful" or "failed"; None without a verdict.
         summary: A sentence beside the verdict.
         warnings: Warnings to read before trusting the numbers.
-        answer: Sentences that answer the question, above all else.
+        answer: Sentences that answer the question, above all else; the table then comes after the pictures.
         tiles: The most important numbers: name, value, and a line of explanation.
         rows: Rows of the table.
         scene: Data of the 3D view, see `implant_scene`; None for no 3D view.
@@ -84,11 +84,11 @@ def page_html(page: Page) -> str:
         _answer(page.answer),
         _tiles(page.tiles),
         _verdict(page),
-        _table(page.rows),
-        _layers(page.layers),
-        _viewer(page.scene),
     ]
-    parts += [_pictures(page.pictures), *(_folded(title, text) for title, text in page.details)]
+    table, views, viewer = _table(page.rows), _layers(page.layers), _viewer(page.scene)
+    pictures = _pictures(page.pictures)
+    parts += [viewer, views, pictures, table] if page.answer else [table, views, viewer, pictures]
+    parts += [_folded(title, text) for title, text in page.details]
     web = files("torchkcreg.visualization") / "web"
     files_of_page = ("page.css", "viewer.js", "layers.js")
     style, *scripts = (web.joinpath(name).read_text(encoding="utf-8") for name in files_of_page)
