@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .commands import VisitFiles, assess
     from .deformation import FreeFormDeformation
     from .geometry import ConeBeamGeometry, MultisourceScanner, VolumeGrid, circular_geometry
     from .implant import Component, ImplantPointCloud, KnownComponent, Screw, find_holes
@@ -37,7 +38,9 @@ _HOMES = {
     "Scene": "scene",
     "Screw": "implant",
     "Stage": "registration",
+    "VisitFiles": "commands",
     "VolumeGrid": "geometry",
+    "assess": "commands",
     "build_scene": "registration",
     "circular_geometry": "geometry",
     "fdk": "reconstruction",

@@ -49,11 +49,11 @@ def _views(text: str) -> list[int] | None:
 
 
 def _assess(options: argparse.Namespace) -> Answer:
-    from torchkcreg.commands import VisitFiles, assess_files
+    from torchkcreg.commands import VisitFiles, assess
 
     names = ("implant", "material", "geometry", "unloaded", "loaded", "loads", "screws", "spectrum", "views")
     files = VisitFiles(**{name: getattr(options, name) for name in (*names, "open_beam", "at", "config")})
-    assessment = assess_files(
+    assessment = assess(
         files,
         options.out,
         overwrite=options.overwrite,

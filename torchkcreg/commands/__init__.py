@@ -1,6 +1,6 @@
 """Functions behind the commands: from input files to a folder of results. One module per command, of the same name."""
 
-from .assess import VisitFiles, assess_files
+from .assess import VisitFiles, assess
 from .assessment import Assessment
 from .compare import Comparison, compare_files
 from .convert import convert
@@ -36,7 +36,7 @@ __all__ = [
     "SimulatedFiles",
     "ViewPlan",
     "VisitFiles",
-    "assess_files",
+    "assess",
     "compare_files",
     "convert",
     "demo",

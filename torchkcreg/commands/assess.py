@@ -100,7 +100,7 @@ class VisitFiles:
             raise ValueError("a point has three finite coordinates, mm")
 
 
-def assess_files(
+def assess(
     files: VisitFiles,
     out: Path,
     *,
