@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from torchkcreg.cli import main
-from torchkcreg.io import write_config, write_projections
+from torchkcreg.commands.assess import beyond_the_screws
+from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.io import read_components, read_mesh, write_config, write_projections
 from torchkcreg.simulation import weight_bearing_case
 
 STAGES = [
@@ -130,3 +132,24 @@ def test_inputs_that_contradict_each_other_are_refused_before_anything_is_writte
 def test_two_scans_of_one_name_are_refused(small_case, scans, tmp_path, capsys):
     assert main(command(small_case, scans, tmp_path / "out", "rest")) == 2
     assert "rest is there 2 times" in capsys.readouterr().err
+
+
+def test_screws_that_may_all_be_in_one_fragment_are_doubted(small_case):
+    screws = read_components(small_case / "screws.json")
+    nodes = ImplantPointCloud.from_mesh(read_mesh(small_case / "implant.stl"), 2.0, dtype=torch.float64).points
+    assert beyond_the_screws(nodes, screws) is None
+    lower = [screw for screw in screws if screw.start[2] < 0]
+    assert 2 <= len(lower) < len(screws)
+    assert re.search(r"reaches \d\d+ mm beyond its last screw", beyond_the_screws(nodes, lower))
+    assert beyond_the_screws(nodes, lower[:1]) is None  # that is said otherwise
+
+
+def test_a_mirrored_scan_is_no_answer(small_case, scans, visit, tmp_path):
+    with np.load(scans / "stand.npz") as file:
+        parts = {name: file[name] for name in file.files}
+    np.savez(tmp_path / "mirrored.npz", **{**parts, "intensity": parts["intensity"][:, :, ::-1]})
+    given = command(small_case, scans, visit, "stand")
+    given[-1] = str(tmp_path / "mirrored.npz")
+    assert main([*given, "--resume", "--no-figures"]) == 3
+    mirrored = json.loads((visit / "assess.json").read_text())["configurations"][0]
+    assert mirrored["status"] == "failed" and "rotation_deg" not in mirrored

@@ -19,7 +19,8 @@ from torchkcreg.evaluation import (
     fragments_of,
     relative_motion,
 )
-from torchkcreg.implant import ImplantPointCloud
+from torchkcreg.geometry import principal_axes
+from torchkcreg.implant import ImplantPointCloud, Screw
 from torchkcreg.io import read_geometry, read_mesh, read_run, write_components, write_figure, write_json
 from torchkcreg.io.runs import CONFIG, DEFORMATION
 from torchkcreg.physics import is_elastic, material
@@ -289,6 +290,8 @@ class _Visit:
         except ValueError as error:
             fragments = fragments_of(cloud.points, [])
             doubts.append(f"{error}; the ends of the implant stand for the fragments instead")
+        if (beyond := beyond_the_screws(cloud.points, first.screws)) is not None:
+            doubts.append(beyond)
         if not first.screws:
             doubts.append("no screws show what is fixed to which fragment: the ends of the implant are used instead")
         place = "gap" if files.at is None else "point asked for"
@@ -322,7 +325,27 @@ class _Visit:
                 carried = load_files(folder, folder / "load", implant=self.files.implant, figures=work.figures)
             gap_load = load_at(carried.carried, self.places[0], motion, self.first, self.cloud)
             reasons += [text for text in carried.warnings if not text.startswith("the registration is")]
-        return LoadedConfiguration(name, result.status, tuple(reasons), load, motion, self.place, carried, gap_load)
+        status = "doubtful" if self.doubts and result.status == "ok" else result.status
+        return LoadedConfiguration(name, status, tuple(reasons), load, motion, self.place, carried, gap_load)
+
+
+def beyond_the_screws(nodes: Tensor, screws: Sequence[Screw]) -> str | None:
+    """A doubt if the implant reaches further beyond its last screw than the widest gap between screws, else None.
+
+    The fracture may then lie beyond the last screw, and the screws all in one fragment.
+    """
+    if len(screws) < 2:
+        return None
+    _, (*_, axis) = principal_axes(nodes)
+    heights = (nodes.new_tensor([screw.start for screw in screws]) @ axis).sort().values
+    low, high = (nodes @ axis).aminmax()
+    beyond = float(torch.stack([heights[0] - low, high - heights[-1]]).max())
+    if beyond <= float(heights.diff().max()):
+        return None
+    return (
+        f"the implant reaches {beyond:.0f} mm beyond its last screw, further than between any two: the screws may all "
+        "be in one fragment"
+    )
 
 
 def _command(files: RegistrationFiles, folder: Path, options: dict[str, Any]) -> str:
