@@ -14,8 +14,11 @@ import torch
 from torch import Tensor
 
 from torchkcreg.evaluation import (
+    BONE_PLACES,
+    CallusStiffness,
     Fragments,
     bone_places,
+    fracture_plane,
     fragments_of,
     relative_motion,
 )
@@ -29,7 +32,7 @@ from torchkcreg.registration import RegisteredImplant, RegistrationResult
 from torchkcreg.search import spread_views
 from torchkcreg.visualization import comparison_figure
 
-from .assessment import Assessment, LoadedConfiguration, load_at
+from .assessment import Assessment, LoadedConfiguration, callus_of, load_at
 from .load import load_files
 from .register import register_files
 from .register_inputs import RegistrationFiles
@@ -148,7 +151,7 @@ def assess(
     screws = work.screws_of(first)
     start = out / names[0]
     results = [work.tried(path, n, start, screws) for path, n in zip(files.loaded, names[1:], strict=True)]
-    visit = _Visit.of(files, first)
+    visit = _Visit.of(files, first, [r.implants[0] for r in results if not isinstance(r, str) and r.status != "failed"])
     loads: Sequence[float | None] = files.loads or [None] * len(results)
     configurations = tuple(
         visit.configuration(name, load, result, work)
@@ -159,6 +162,7 @@ def assess(
     assessment = Assessment(
         names[0], configurations, assumed, (*doubts, *visit.doubts), tuple(work.commands), folder=out
     )
+    assessment = replace(assessment, callus=visit.callus(configurations))
     _write(assessment, figures)
     if volumes and visit.regions:
         mineral, missing = work.volumes(out / names[0], visit.regions, spacing_mm)
@@ -282,11 +286,12 @@ class _Visit:
     doubts: tuple[str, ...]
 
     @classmethod
-    def of(cls, files: VisitFiles, first: RegisteredImplant) -> _Visit:
+    def of(cls, files: VisitFiles, first: RegisteredImplant, loaded: Sequence[RegisteredImplant]) -> _Visit:
         cloud = ImplantPointCloud.from_mesh(read_mesh(files.implant), _PITCH_MM, dtype=torch.float64)
         assumed, doubts = [], []
         try:
-            fragments = fragments_of(cloud.points, first.screws, radius_mm=first.follow_radius_mm)
+            plane = fracture_plane(first, [(implant, None) for implant in loaded], cloud.points)
+            fragments = fragments_of(cloud.points, first.screws, radius_mm=first.follow_radius_mm, plane=plane)
         except ValueError as error:
             fragments = fragments_of(cloud.points, [])
             doubts.append(f"{error}; the ends of the implant stand for the fragments instead")
@@ -305,6 +310,14 @@ class _Visit:
             regions = regions_of(first, cloud.points, bone, axis / axis.norm())
             assumed.append("the bone lies along the screws: its axis half-way between the implant and their tips")
         return cls(files, first, cloud, fragments, places, place, regions, tuple(assumed), tuple(doubts))
+
+    def callus(self, configurations: Sequence[LoadedConfiguration]) -> CallusStiffness | None:
+        """Stiffness of the tissue in the gap; None if something that it takes is not known."""
+        motions = [c.motion for c in configurations if c.motion is not None]
+        if not motions or len(self.places) < 1 + len(BONE_PLACES):
+            return None
+        gap, *bone = self.first.warp(torch.cat([self.fragments.gap[None], self.places[-len(BONE_PLACES) :]]))
+        return callus_of(configurations, gap, torch.stack(bone), motions[0].axes)
 
     def configuration(
         self, name: str, load: float | None, result: RegistrationResult | str, work: _Work

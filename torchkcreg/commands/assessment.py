@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchkcreg.evaluation import BONE_PLACES, RelativeMotion
+from torchkcreg.evaluation import BONE_PLACES, CallusStiffness, GapLoad, RelativeMotion, callus_stiffness
 from torchkcreg.geometry import fit_rigid
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.mechanics import CarriedLoad
@@ -137,6 +138,7 @@ class Assessment:
         warnings: What to doubt, a line each.
         commands: Commands that repeat each step.
         mineral: Bone mineral of regions of the unloaded scan; empty without volumes.
+        callus: Stiffness of the tissue in the gap; None without known forces, stiffness of the alloy, or screws.
         folder: Output folder.
     """
 
@@ -146,6 +148,7 @@ class Assessment:
     warnings: tuple[str, ...]
     commands: tuple[str, ...]
     mineral: tuple[dict[str, Any], ...] = ()
+    callus: CallusStiffness | None = None
     folder: Path = field(default=Path())
 
     def to_dict(self) -> dict[str, Any]:
@@ -158,11 +161,18 @@ class Assessment:
             "warnings": list(self.warnings),
             "commands": list(self.commands),
             "mineral": list(self.mineral),
+            **({} if self.callus is None else {"callus": self.callus.to_dict()}),
         }
 
     def __str__(self) -> str:
         lines = [f"{c.sentence()} ({c.status})" for c in self.configurations]
         lines += [f"doubt: {c.name}: {reason}" for c in self.configurations for reason in c.reasons]
+        if self.callus is not None:
+            axial, bending = self.callus.axial, self.callus.bending
+            lines.append(
+                f"the tissue in the gap has a stiffness of {_pm(axial, self.callus.axial_std)} N/mm and "
+                f"{_pm(bending, self.callus.bending_std)} N m/degree"
+            )
         lines += [
             f"{m['region']}: {m['hydroxyapatite_mg_ml']:.0f} mg/mL of hydroxyapatite in {m['volume_ml']:.2f} mL"
             for m in self.mineral
@@ -197,6 +207,34 @@ def load_at(
     turn = turn if float(turn[2, 2]) > 0 else -turn  # above is below
     both = torch.block_diag(turn, turn)
     return both @ value, (both.square() @ variance).sqrt()
+
+
+def callus_of(
+    configurations: Sequence[LoadedConfiguration], gap: Tensor, bone: Tensor, axes: Tensor
+) -> CallusStiffness | None:
+    """Stiffness of the tissue in the gap; None if no configuration has a known force, a motion and a load.
+
+    Args:
+        configurations: The scans under load.
+        gap: Point (3,) of the gap at the implant.
+        bone: Near cortex, axis and far cortex (3, 3) there.
+        axes: The motion's axes in the same frame, as rows (3, 3).
+    """
+    loads = []
+    for c in configurations:
+        if c.load_n is None or c.motion is None or c.gap_load is None:
+            continue
+        (moment, std), motion = c.gap_load, c.motion
+        turn, turn_std = (torch.deg2rad(x[0]).item() for x in (motion.rotation_deg, motion.rotation_std_deg))
+        closing, closing_std = -motion.places_mm[2, 2].item(), motion.places_std_mm[2, 2].item()
+        loads.append(GapLoad(c.load_n, moment[3].item(), std[3].item(), closing, closing_std, turn, turn_std))
+    if not loads:
+        return None
+    lever = float((gap - bone[1]) @ axes[1])
+    try:
+        return callus_stiffness(loads, lever, 0.5 * float((bone[2] - bone[0]).norm()))
+    except ValueError:
+        return None
 
 
 def _length(vector: Tensor, std: Tensor) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchkcreg.evaluation import AXES, RelativeMotion, fragments_of, frame_changes, relative_motion
+from torchkcreg.evaluation import AXES, RelativeMotion, fracture_plane, fragments_of, frame_changes, relative_motion
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import implant_of_run, mesh_of_run, read_mesh, write_figure, write_json, write_text
@@ -122,10 +122,17 @@ def compare_files(
         raise ValueError(f"a plane is a point, or a point and a normal: 3 or 6 numbers, got {len(plane)}")
     first, mesh, doubts = _implant(unloaded, name)
     cloud = ImplantPointCloud.from_mesh(mesh, _PITCH_MM, dtype=torch.float64)
-    fracture = None
+    warnings, seconds = list(doubts), []
+    for folder in loaded:
+        second, second_mesh, doubts = _implant(folder, name)
+        warnings += doubts
+        seconds.append((second, _nearest(frame_changes(mesh, second_mesh), first, second, cloud.points)))
+    fracture: tuple[Tensor, Tensor | None] | None = None
     if plane is not None:
         numbers = torch.tensor(list(plane), dtype=torch.float64)
         fracture = numbers[:3], numbers[3:] if len(plane) == 6 else None
+    elif fragment is None:
+        fracture = fracture_plane(first, seconds, cloud.points)
     fragments = fragments_of(
         cloud.points,
         first.screws,
@@ -133,14 +140,9 @@ def compare_files(
         plane=fracture,
         mesh=None if fragment is None else read_mesh(fragment),
     )
-    warnings, motions = list(doubts), []
     if not first.screws:
         warnings.append("no screws show what is fixed to which fragment: the ends of the implant are used instead")
-    for folder in loaded:
-        second, second_mesh, doubts = _implant(folder, name)
-        warnings += doubts
-        change = _nearest(frame_changes(mesh, second_mesh), first, second, cloud.points)
-        motions.append(relative_motion(first, second, cloud, fragments, to_second=change))
+    motions = [relative_motion(first, second, cloud, fragments, to_second=change) for second, change in seconds]
     compliance, std = _slopes(motions, loads) if loads else (None, None)
     names = tuple(str(folder) for folder in loaded)
     comparison = Comparison(names, tuple(motions), tuple(loads), compliance, std, tuple(warnings), out)

@@ -49,7 +49,11 @@ def write_visit_page(folder: Path, *, out: Path | None = None) -> Path:
                 *(f"{c['name']}: {reason}" for c in content["configurations"] for reason in c["reasons"]),
                 *content["warnings"],
             ],
-            rows=[*(row for c in measured for row in _rows(c)), *map(_mineral_row, content.get("mineral", []))],
+            rows=[
+                *(row for c in measured for row in _rows(c)),
+                *_callus_rows(content),
+                *map(_mineral_row, content.get("mineral", [])),
+            ],
             scene=_scene(folder, content["unloaded"], measured[-1]) if measured else None,
             layers=[
                 (f"{c['name']}, {label}", grey, overlay)
@@ -110,6 +114,21 @@ def _rows(c: dict[str, Any]) -> list[Row]:
             moment, std = (c[f"{name}_moment_{part}nmm"] / 1000 for part in ("", "std_"))
             rows.append(Row(f"moment of {name.replace('_', ' ')}", f"{moment:.2f} N m", f"{std:.2f} N m"))
     return rows
+
+
+def _callus_rows(content: dict[str, Any]) -> list[Row]:
+    callus = content.get("callus")
+    if callus is None:
+        return []
+    about = "if the force acts along the bone's axis, and the tissue is an elastic column as wide as the bone"
+    axial, axial_std = callus["axial_n_per_mm"], callus["axial_std_n_per_mm"]
+    bending, bending_std = callus["bending_nm_per_deg"], callus["bending_std_nm_per_deg"]
+    share, share_std = (100 * callus[name][-1] for name in ("shares_of_load", "shares_of_load_std"))
+    return [
+        Row("stiffness of the tissue in the gap, axial", f"{axial:.0f} N/mm", f"{axial_std:.0f} N/mm", about),
+        Row("its bending stiffness", f"{bending:.3f} N m/°", f"{bending_std:.3f} N m/°"),
+        Row("its share of the largest load", f"{share:.0f} %", f"{share_std:.0f} %"),
+    ]
 
 
 def _mineral_row(m: dict[str, Any]) -> Row:

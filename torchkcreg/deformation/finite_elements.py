@@ -10,7 +10,15 @@ import torch
 from torch import Tensor, nn
 
 from torchkcreg.implant import ImplantPointCloud
-from torchkcreg.mechanics import ExpectedLoads, Hold, Superelement, shares_of_holds, sides_of_holds, used_holds
+from torchkcreg.mechanics import (
+    ExpectedLoads,
+    Hold,
+    Superelement,
+    hold_motions,
+    shares_of_holds,
+    sides_of_holds,
+    used_holds,
+)
 from torchkcreg.mechanics.holds import rigid_fields
 
 from .deformation import Deformation, Level, Motion
@@ -176,8 +184,12 @@ class FiniteElementDeformation(Deformation):
         """
         heads = self.rested(heads)
         self.shares = shares_of_holds(self.superelement, heads, self.unused)
-        element = self.superelement
-        self.sides = sides_of_holds(element.centers, element.sections.axis, used_holds(element, heads))
+        element, amounts = self.superelement, self.amounts.detach()
+        used, turns = used_holds(element, heads), None
+        if used and bool(amounts.any()):
+            motions = hold_motions(element.hexahedra, element.nodal, [element.holds[hold] for hold in used])
+            turns = torch.einsum("a,aui->ui", amounts, motions[..., 3:].to(amounts))
+        self.sides = sides_of_holds(element.centers, element.sections.axis, used, turns)
         self.expected = ExpectedLoads.of(self.superelement, self.shares, self.sides)
 
     def outside(self, points: Tensor) -> Tensor:

@@ -9,10 +9,11 @@ from torchkcreg.geometry import distance_to
 from .alignment import align_to_surface, frame_changes, rigid_coherent_point_drift
 from .bead_shadows import bead_shadows, track_beads
 from .beads import Beads, find_beads
+from .callus import CallusStiffness, GapLoad, callus_stiffness
 from .densitometry import MineralContent, mineral_content
 from .displacement_map import DisplacementMap, displacement_map
 from .distances import nearest_node_distances, nearest_node_floor, surface_distances
-from .fragments import BONE_PLACES, Fragments, bone_places, fragments_of
+from .fragments import BONE_PLACES, Fragments, bone_places, fracture_plane, fragments_of
 from .frame_motion import FRAME_COLUMNS, FrameMotion, frame_motion
 from .point_errors import PointMetrics, bb_rmse, evaluate, evaluate_points, point_errors
 from .regions import RegionStatistics, cylinder_region, region_statistics
@@ -25,10 +26,12 @@ __all__ = [
     "BONE_PLACES",
     "FRAME_COLUMNS",
     "Beads",
+    "CallusStiffness",
     "DisplacementMap",
     "DistanceStatistics",
     "Fragments",
     "FrameMotion",
+    "GapLoad",
     "MineralContent",
     "PointMetrics",
     "RegionStatistics",
@@ -38,6 +41,7 @@ __all__ = [
     "bb_rmse",
     "bead_shadows",
     "bone_places",
+    "callus_stiffness",
     "cylinder_region",
     "displacement_map",
     "distance_statistics",
@@ -46,6 +50,7 @@ __all__ = [
     "evaluate_points",
     "evaluate_shape",
     "find_beads",
+    "fracture_plane",
     "fragments_of",
     "frame_changes",
     "frame_motion",

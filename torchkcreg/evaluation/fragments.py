@@ -10,8 +10,10 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchkcreg.geometry import principal_axes
+from torchkcreg.geometry import fit_rigid, principal_axes, transform_points, vector_from_rotation
 from torchkcreg.implant import Screw
+from torchkcreg.mechanics import fracture_among
+from torchkcreg.registration import RegisteredImplant
 
 BONE_PLACES = ("near cortex", "bone axis", "far cortex")
 _AROUND_MM = 4.0  # of the implant's length, where its thickness is measured
@@ -39,6 +41,38 @@ class Fragments:
     def swapped(self) -> Fragments:
         """The same with lower and upper fragment exchanged."""
         return Fragments(self.upper, self.lower, self.gap, self.names[::-1])
+
+
+def fracture_plane(
+    first: RegisteredImplant, others: Sequence[tuple[RegisteredImplant, Tensor | None]], nodes: Tensor
+) -> tuple[Tensor, None] | None:
+    """Plane between those neighbouring screws that turned most against each other, for `fragments_of`; None without.
+
+    Screws of one fragment turn together, so that the implant bends at the fracture. See `fracture_among`.
+
+    Args:
+        first: Registration without load.
+        others: Registrations under load, each with the rigid transform (4, 4) from the first one's frame of the implant
+            to its own; None for the same frame.
+        nodes: Nodes (N, 3) of the undeformed implant in the first one's frame.
+    """
+    nodes = nodes.double()
+    middle, (*_, axis) = principal_axes(nodes)
+    heads = torch.stack([middle, *(nodes.new_tensor(screw.start) for screw in first.screws)])[1:]
+    if len(heads) < 2 or not others:
+        return None
+    distance = torch.cdist(heads, nodes)
+    near = distance <= distance.amin(1, keepdim=True).clamp_min(first.follow_radius_mm)
+    turns = []
+    for other, change in others:
+        there = nodes if change is None else transform_points(change, nodes)
+        before, after = first.warp(nodes), other.warp(there)
+        motions = [fit_rigid(before[mine], after[mine]) for mine in near]
+        turns.append(torch.stack([vector_from_rotation(motions[0][:3, :3].T @ m[:3, :3]) for m in motions]))
+    heights = (heads - middle) @ axis
+    bent = torch.cat(turns, dim=1)
+    height = fracture_among(heights, bent)
+    return None if height is None else (middle + height * axis, None)
 
 
 def fragments_of(

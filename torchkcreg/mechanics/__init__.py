@@ -5,7 +5,7 @@ from .body import ElasticBody
 from .carried import CarriedLoad, node_stresses
 from .hexahedra import Hexahedra, edge_for
 from .holds import Hold, holds_of
-from .rigid_fragments import fragment_loads, hold_motions, rigid_at, sides_of_holds
+from .rigid_fragments import fracture_among, fragment_loads, hold_motions, rigid_at, sides_of_holds
 from .sections import Sections
 from .stiffness import stiffness_matrix
 from .stress import von_mises
@@ -21,6 +21,7 @@ __all__ = [
     "Sections",
     "Superelement",
     "edge_for",
+    "fracture_among",
     "fragment_loads",
     "hold_motions",
     "holds_of",

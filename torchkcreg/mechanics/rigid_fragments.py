@@ -12,6 +12,8 @@ from torchkcreg.geometry import transform_points
 from .hexahedra import Hexahedra
 from .holds import Hold, rigid_fields
 
+_MORE = 2.0  # so many times the rotation across the widest gap shows that the fracture is elsewhere
+
 
 def hold_motions(hexahedra: Hexahedra, nodal: Tensor, holds: Sequence[Hold]) -> Tensor:
     """Translation and small rotation (A, U, 6) of U holds for nodal displacements (A, N, 3)."""
@@ -32,8 +34,35 @@ def rigid_at(center: Tensor) -> Tensor:
     return torch.cat([torch.cat([identity, turning], dim=1), torch.cat([torch.zeros_like(identity), identity], dim=1)])
 
 
-def sides_of_holds(centers: Tensor, axis: Tensor, used: list[int]) -> Tensor:
-    """Fragment of each hold (H,): -1 below and +1 above the widest gap between used holds along the implant, 0 unused.
+def fracture_among(heights: Tensor, turns: Tensor | None = None) -> float | None:
+    """Height of the fracture among screws at heights (U,) along an implant; None for fewer than two.
+
+    Screws of one fragment turn together. The fracture lies between those neighbours that turned most against each
+    other, if that is at least twice as much as across the widest gap; else in the middle of the widest gap.
+
+    Args:
+        heights: Heights of the screws.
+        turns: Small rotation vectors (U, 3) of the implant around them; None if it is not bent.
+
+    Example:
+        >>> heights = torch.tensor([0.0, 30.0, 45.0, 60.0])
+        >>> fracture_among(heights), fracture_among(heights, torch.tensor([[0.0], [0.0], [0.02], [0.02]]).expand(4, 3))
+        (15.0, 37.5)
+    """
+    if len(heights) < 2:
+        return None
+    order = heights.argsort()
+    heights = heights[order]
+    place = widest = int(heights.diff().argmax())
+    if turns is not None:
+        between = turns[order].diff(dim=0).norm(dim=-1)
+        most = int(between.argmax())
+        place = most if float(between[most]) > _MORE * float(between[widest]) else widest
+    return float(heights[place] + heights[place + 1]) / 2
+
+
+def sides_of_holds(centers: Tensor, axis: Tensor, used: list[int], turns: Tensor | None = None) -> Tensor:
+    """Fragment of each hold (H,): -1 below and +1 above the fracture, 0 for holds without a screw.
 
     All are 0 with fewer than two used holds.
 
@@ -41,16 +70,14 @@ def sides_of_holds(centers: Tensor, axis: Tensor, used: list[int]) -> Tensor:
         centers: Centres of the holds (H, 3).
         axis: Direction (3,) along the implant.
         used: Numbers of the holds that have a screw.
+        turns: Small rotation vectors (U, 3) of these; None if the implant is not bent. See `fracture_among`.
     """
     heights = centers @ axis
     sides = torch.zeros(len(centers), dtype=torch.long, device="cpu")
-    if len(used) < 2:
-        return sides
-    order = heights[used].sort().values
-    widest = int(order.diff().argmax())
-    middle = (order[widest] + order[widest + 1]) / 2
-    for hold in used:
-        sides[hold] = 1 if float(heights[hold]) > float(middle) else -1
+    fracture = fracture_among(heights[used], turns)
+    if fracture is not None:
+        for hold in used:
+            sides[hold] = 1 if float(heights[hold]) > fracture else -1
     return sides
 
 

@@ -25,6 +25,7 @@ from .specimen import DISTAL, PROXIMAL, Specimen
 _PITCH_MM = 0.4  # largest node spacing of the finite elements; less if a tenth of the implant's thickness is less
 _NEAR_MM = 8.0  # the screw follows the implant's vertices within this distance of its head
 _HIGHEST = 0.99  # quantile taken as the highest stress: the maximum itself is a peak beside a hole
+_TISSUE_POISSON = 0.3
 _TURN_MM = 20.0  # lever arm that makes rotations and translations comparable
 
 
@@ -93,9 +94,8 @@ class ElasticConstruct:
         element, number = self.element, self.element.num_amounts
         loads, used = element.loads, sorted(self.sides)
         scale = loads.new_tensor([1.0] * 3 + [_TURN_MM] * 3)
-        held = (hold_motions(element.hexahedra, element.nodal, [element.holds[n] for n in used]) * scale).flatten(
-            1
-        )  # (A, 6 U)
+        seats = [element.holds[hold] for hold in used]
+        held = (hold_motions(element.hexahedra, element.nodal, seats) * scale).flatten(1)  # (A, 6 U)
         rigid = held.new_zeros(6 * len(used), 12)
         for row, hold in enumerate(used):
             first = 6 if self.sides[hold] == PROXIMAL else 0
@@ -108,10 +108,31 @@ class ElasticConstruct:
         idle = loads[:, free] / scale
         compliance = float(held.abs().max() / loads.abs().max())  # mm/N: gives all rows the same scale
         known = torch.cat([wrench, idle.flatten(1)], dim=1).T * compliance
-        rows = torch.cat([torch.cat([held.T, rigid], dim=1), torch.cat([known, known.new_zeros(len(known), 12)], 1)])
+        shared = known.new_zeros(len(known), 12)
+        shared[:6] = self._callus_wrench(at) * compliance
+        rows = torch.cat([torch.cat([held.T, rigid], dim=1), torch.cat([known, shared], 1)])
         right_hand_side = rows.new_zeros(len(rows))
         right_hand_side[6 * len(used) : 6 * len(used) + 3] = force * compliance
         return torch.linalg.lstsq(rows, right_hand_side[:, None], driver="gelsd").solution[:number, 0]
+
+    def _callus_wrench(self, at: Tensor) -> Tensor:
+        """Force, and moment about a point (3,) over the lever arm, through the callus, (6, 12), per fragment's motion.
+
+        The callus is a short column as wide as the cortex: of axial stiffness k, it has a shear stiffness of k G / E, a
+        bending stiffness of k I / A and a torsional one of k G J / (E A).
+        """
+        bone = self.specimen.recipe.limb.bone
+        wrench = torch.zeros(6, 12, dtype=torch.float64, device="cpu")
+        if bone is None or bone.callus == 0:
+            return wrench
+        center = torch.tensor([*bone.axis[:2], self.specimen.fracture], dtype=torch.float64, device="cpu")
+        spread = (bone.outer_radius**2 + bone.inner_radius**2) / 4  # I / A of a ring
+        shear = 1 / (2 * (1 + _TISSUE_POISSON))
+        stiffness = bone.callus * center.new_tensor([shear, shear, 1.0, spread, spread, 2 * shear * spread])
+        relative = stiffness[:, None] * rigid_at(center)
+        turned = relative[3:] + torch.linalg.cross((center - at).expand(6, 3), relative[:3].T).T
+        through = torch.cat([relative[:3], turned / _TURN_MM])
+        return torch.cat([-through, through], dim=1)
 
     def loaded(self, recipe: LoadRecipe) -> Loaded:
         """Motion of the specimen under a force. The distal fragment moves only by the recipe's pose."""

@@ -13,6 +13,7 @@ _UNITS = {
     "length": {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3},
     "angle": {"deg": 1.0, "°": 1.0, "rad": 180 / math.pi, "mrad": 0.18 / math.pi},
     "force": {"N": 1.0, "kN": 1000.0},
+    "stiffness": {"N/mm": 1.0, "kN/mm": 1000.0, "N/m": 1e-3},
     "voltage": {"kV": 1.0, "kVp": 1.0, "V": 1e-3},
     "share": {"": 1.0, "%": 0.01},
 }
@@ -89,6 +90,8 @@ Angle = Annotated[float, BeforeValidator(_number("angle")), _scalar_text("deg")]
 """An angle, stored in degrees; a unit is required."""
 Voltage = Annotated[float, BeforeValidator(_number("voltage")), _scalar_text("kV")]
 """A tube voltage, stored in kV; a unit is required."""
+Stiffness = Annotated[float, BeforeValidator(_number("stiffness")), _scalar_text("N/mm")]
+"""A stiffness, stored in N/mm; a unit is required."""
 Share = Annotated[float, BeforeValidator(_number("share"))]
 """A fraction: a plain number or a percentage."""
 Place = Annotated[Vector3, BeforeValidator(_vector("length")), _vector_text("mm")]

@@ -11,7 +11,7 @@ from torchkcreg.geometry import MultisourceScanner
 from torchkcreg.options import Config
 from torchkcreg.physics.spectra import DEFAULT_FILTRATION_MM
 
-from .quantities import Angle, Length, Place, Push, Share, Turn, Voltage
+from .quantities import Angle, Length, Place, Push, Share, Stiffness, Turn, Voltage
 
 
 class TubeRecipe(Config):
@@ -169,6 +169,7 @@ class BoneRecipe(Config):
         outer_radius, inner_radius: Radii of the cortex.
         gap: Distance between the fragments, centred on `gap_at`.
         gap_at: Height of the fracture. Screws below it hold the distal fragment.
+        callus: Axial stiffness of elastic tissue that fills the gap, as wide as the cortex; it shares a force.
         reach: Distance from the fracture to the far end of each fragment.
         material: Material of the cortex.
         marrow: Material that fills the bone; empty if None.
@@ -179,6 +180,7 @@ class BoneRecipe(Config):
     inner_radius: Length = 8.0
     gap: Length = 4.0
     gap_at: Length = 0.0
+    callus: Stiffness = Field(0.0, ge=0)
     reach: Length = 150.0
     material: str = "cortical_bone"
     marrow: str | None = None
