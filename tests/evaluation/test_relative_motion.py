@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from torchkcreg.deformation import Deviations
-from torchkcreg.evaluation import fragments_of, frame_changes, relative_motion
+from torchkcreg.evaluation import fracture_plane, fragments_of, frame_changes, relative_motion
 from torchkcreg.geometry import invert_rigid, rigid_matrix, transform_points
 from torchkcreg.implant import ImplantPointCloud, Screw
 
@@ -118,3 +118,22 @@ def test_frames_of_one_implant_are_found_and_another_implant_is_refused(mesh) ->
     assert min(float((change - CAD).abs().max()) for change in changes) < 0.05
     with pytest.raises(ValueError, match="not of the same implant"):
         frame_changes(mesh, trimesh.creation.box((12.0, 4.0, 120.0)))
+
+
+def test_the_fracture_is_where_the_screws_turn_against_each_other_not_where_they_are_furthest_apart(cloud) -> None:
+    # screws at -50, -30, 20, 50: the widest gap is from -30 to 20, and the implant bends at 35
+    def bent(points):
+        turned = rigid_matrix(torch.tensor([0.04, 0.0, 0.0]).double(), torch.tensor([0.0, 0.0, 0.0]).double())
+        shifted = points - torch.tensor([0.0, 0.0, 35.0]).double()
+        return torch.where(points[:, 2:] > 35, transform_points(turned, shifted), shifted)
+
+    straight = SimpleNamespace(warp=lambda points: points.double(), screws=SCREWS, follow_radius_mm=8.0)
+    loaded = SimpleNamespace(warp=bent, screws=SCREWS, follow_radius_mm=8.0)
+    plane = fracture_plane(straight, [(loaded, None)], cloud.points)
+    assert abs(float(plane[0][2])) == pytest.approx(35.0, abs=0.1)
+    parts = fragments_of(cloud.points, SCREWS, plane=plane)
+    assert sorted(map(len, parts.names)) == [1, 3]
+    # a straight implant does not tell: the widest gap
+    still = fracture_plane(straight, [(straight, None)], cloud.points)
+    assert float(still[0][2]) == pytest.approx(-5.0, abs=0.1)
+    assert fracture_plane(straight, [], cloud.points) is None

@@ -263,3 +263,22 @@ def test_holds_belong_to_the_fragment_on_their_side_of_the_widest_gap(element) -
     sign = int(torch.sign(axis[2]))
     assert (sign * sides_of_holds(element.centers, axis, [0, 2, 3])).tolist() == [-1, 0, 1, 1]
     assert sides_of_holds(element.centers, axis, [2]).tolist() == [0, 0, 0, 0]
+
+
+def test_a_bent_implant_shows_where_the_fracture_is(element) -> None:
+    axis, used = element.sections.axis, [0, 1, 2, 3]
+    bent_between_0_and_1 = torch.zeros(4, 3).double()
+    bent_between_0_and_1[1:, 0] = 0.02
+    sides = sides_of_holds(element.centers, axis, used, bent_between_0_and_1)
+    assert (sides != sides[0]).tolist() == [False, True, True, True]
+    deformation = FiniteElementDeformation(element)
+    heads = element.centers
+    deformation.fixed_at(heads)
+    as_undeformed = deformation.sides.clone()
+    loads = torch.cat([element.loads, element.stiff])
+    scale = loads.new_tensor([200.0] * 3 + [1500.0] * 3)
+    wanted = torch.tensor([-1, -1, -1, 1]) * (1 if float(axis[2]) > 0 else -1)
+    moved = fragment_loads(loads, element.energy, element.centers, wanted, scale)[3]
+    deformation.amounts.data.copy_(1e4 * moved[: element.num_amounts])
+    deformation.fixed_at(heads)
+    assert deformation.sides.tolist() == wanted.tolist() != as_undeformed.tolist()

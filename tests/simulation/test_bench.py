@@ -13,6 +13,7 @@ import trimesh
 import yaml
 
 import torchkcreg
+from torchkcreg.evaluation import GapLoad, callus_stiffness
 from torchkcreg.geometry import circular_geometry
 from torchkcreg.physics import Spectrum, elastic_constants, material, tungsten_spectrum
 from torchkcreg.plain import plain
@@ -206,6 +207,24 @@ def test_motion_grows_with_the_force_and_a_force_that_the_alloy_does_not_bear_is
     torch.testing.assert_close(10 * small_force, large, rtol=1e-5, atol=1e-9)
     with pytest.warns(UserWarning, match="titanium yields"):
         construct.loaded(LoadRecipe.of({"force": "[0, 0, -5000] N"}))
+
+
+@pytest.mark.parametrize("stiffness", [100.0, 2000.0])
+def test_a_callus_takes_its_share_of_the_load_and_is_found_again_from_motion_and_moment(construct, stiffness):
+    force = 100.0
+    bone = {"callus": f"{stiffness} N/mm"}
+    with_callus = ElasticConstruct(specimen(small(limb={"bone": bone})))
+    states = {c: c.loaded(LoadRecipe.of({"force": f"[0, 0, {-force}] N"})) for c in (construct, with_callus)}
+    moments = [float(s.carried.section_loads[len(s.carried.heights) // 2][3:].norm()) for s in states.values()]
+    assert moments[1] < 0.99 * moments[0]
+    state = states[with_callus]
+    relative = torch.linalg.inv(state.fragments["distal"]) @ state.fragments["proximal"]
+    axis = torch.tensor([0.0, -17.0, 0.0, 1.0], dtype=torch.float64)
+    closing = -float((relative @ axis - axis)[2])
+    turn = float(torch.acos(((relative[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
+    found = callus_stiffness([GapLoad(force, moments[1], 1.0, closing, 0.0, turn, 0.0)], 17.0, 13.0)
+    assert found.axial == pytest.approx(stiffness, rel=0.05)
+    assert 0 < found.shares[0] < 1
 
 
 def test_a_force_needs_screws_in_both_fragments():

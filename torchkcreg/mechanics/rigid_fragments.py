@@ -12,6 +12,7 @@ from torchkcreg.geometry import transform_points
 from .hexahedra import Hexahedra
 from .holds import Hold, rigid_fields
 
+_LEAST_RAD = 2e-3  # smaller rotations between screws are within their error
 _MORE = 2.0  # so many times the rotation across the widest gap shows that the fracture is elsewhere
 
 
@@ -38,7 +39,7 @@ def fracture_among(heights: Tensor, turns: Tensor | None = None) -> float | None
     """Height of the fracture among screws at heights (U,) along an implant; None for fewer than two.
 
     Screws of one fragment turn together. The fracture lies between those neighbours that turned most against each
-    other, if that is at least twice as much as across the widest gap; else in the middle of the widest gap.
+    other, if that is a tenth of a degree and twice as much as across the widest gap; else in the widest gap.
 
     Args:
         heights: Heights of the screws.
@@ -57,7 +58,8 @@ def fracture_among(heights: Tensor, turns: Tensor | None = None) -> float | None
     if turns is not None:
         between = turns[order].diff(dim=0).norm(dim=-1)
         most = int(between.argmax())
-        place = most if float(between[most]) > _MORE * float(between[widest]) else widest
+        if float(between[most]) > max(_MORE * float(between[widest]), _LEAST_RAD):
+            place = most
     return float(heights[place] + heights[place + 1]) / 2
 
 
