@@ -2,13 +2,15 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from torchkcreg.cli import main
-from torchkcreg.commands.assess import beyond_the_screws
+from torchkcreg.commands.assess import beyond_the_screws, turned_around
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import read_components, read_mesh, write_config, write_projections
 from torchkcreg.simulation import weight_bearing_case
@@ -144,6 +146,21 @@ def test_screws_that_may_all_be_in_one_fragment_are_doubted(small_case):
     assert 2 <= len(lower) < len(screws)
     assert re.search(r"reaches \d\d+ mm beyond its last screw", beyond_the_screws(nodes, lower))
     assert beyond_the_screws(nodes, lower[:1]) is None  # that is said otherwise
+
+
+def test_a_rival_is_the_same_plate_turned_around_or_another_place():
+    nodes = ImplantPointCloud.from_mesh(trimesh.creation.box((12.0, 4.0, 120.0)), 1.0, dtype=torch.float64).points
+    here, half_turn = torch.eye(4).double(), torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).double()
+    elsewhere = here.clone()
+    elsewhere[2, 3] = 18.0
+
+    def result(pose):
+        rival = None if pose is None else {"pose": pose.tolist()}
+        return SimpleNamespace(diagnostics={"rival": rival}, implants=[SimpleNamespace(implant_to_world=here)])
+
+    assert turned_around(result(half_turn), nodes)
+    assert not turned_around(result(elsewhere), nodes)
+    assert not turned_around(result(None), nodes)
 
 
 def test_a_mirrored_scan_is_no_answer(small_case, scans, visit, tmp_path):

@@ -22,7 +22,7 @@ from torchkcreg.evaluation import (
     fragments_of,
     relative_motion,
 )
-from torchkcreg.geometry import principal_axes
+from torchkcreg.geometry import principal_axes, transform_points
 from torchkcreg.implant import ImplantPointCloud, Screw
 from torchkcreg.io import read_geometry, read_mesh, read_run, write_components, write_figure, write_json
 from torchkcreg.io.runs import CONFIG, DEFORMATION
@@ -39,6 +39,8 @@ from .register_inputs import RegistrationFiles
 from .visit_page import ASSESSMENT, write_visit_page
 from .visit_volumes import FEWEST_VIEWS, regions_of, volumes_of
 
+TURNED_AROUND = "the implant is symmetric: nothing tells its ends apart, but motion and load do not depend on that"
+_SAMPLE, _SAME_METAL_MM = 1000, 3.0
 _PITCH_MM = 1.0
 _MOST_VIEWS = 12  # of a scan: more take longer than the answer gains
 _FEW = 15  # views; of a scan with more, some are chosen
@@ -157,8 +159,13 @@ def assess(
         visit.configuration(name, load, result, work)
         for name, load, result in zip(names[1:], loads, results, strict=True)
     )
-    doubts = [f"{names[0]} is {unloaded.status}: {why}" for why in unloaded.warnings if unloaded.status != "ok"]
-    assumed = (*work.assumed, *visit.assumed)
+    turned = turned_around(unloaded, visit.cloud.points)
+    doubts = [
+        f"{names[0]} is {unloaded.status}: {why}"
+        for why in unloaded.warnings
+        if unloaded.status != "ok" and not (turned and why.startswith("the implant fits nearly as well"))
+    ]
+    assumed = (*work.assumed, *visit.assumed, *([TURNED_AROUND] if turned else []))
     assessment = Assessment(
         names[0], configurations, assumed, (*doubts, *visit.doubts), tuple(work.commands), folder=out
     )
@@ -340,6 +347,22 @@ class _Visit:
             reasons += [text for text in carried.warnings if not text.startswith("the registration is")]
         status = "doubtful" if self.doubts and result.status == "ok" else result.status
         return LoadedConfiguration(name, status, tuple(reasons), load, motion, self.place, carried, gap_load)
+
+
+def turned_around(result: RegistrationResult, nodes: Tensor) -> bool:
+    """True if a rival place of a registered implant is the same metal turned around, since the implant is symmetric.
+
+    Args:
+        result: The registration.
+        nodes: Nodes (N, 3) of its first implant, undeformed.
+    """
+    pose = (result.diagnostics.get("rival") or {}).get("pose")
+    if pose is None:
+        return False
+    nodes = nodes[:: max(1, len(nodes) // _SAMPLE)].double()
+    here = transform_points(result.implants[0].implant_to_world, nodes)
+    there = transform_points(torch.tensor(pose, dtype=torch.float64), nodes)
+    return float(torch.cdist(there, here).amin(1).square().mean().sqrt()) < _SAME_METAL_MM
 
 
 def beyond_the_screws(nodes: Tensor, screws: Sequence[Screw]) -> str | None:
