@@ -20,6 +20,7 @@ from .densitometry import add_densitometry
 from .doctor import add_doctor
 from .evaluate import add_evaluate
 from .experiment import add_experiment
+from .follow import add_follow
 from .info import add_info
 from .load import add_load
 from .plan import add_plan
@@ -61,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"torchkcreg {torchkcreg.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     add_assess(commands)
+    add_follow(commands)
     add_register(commands)
     add_warp(commands)
     add_evaluate(commands)

@@ -8,6 +8,7 @@ from .demo import demo
 from .densitometry import densitometry_files
 from .doctor import doctor, self_test
 from .evaluate import FileEvaluation, evaluate_files
+from .follow import Healing, follow
 from .info import describe, describe_installation, picture_geometry, runs_compared
 from .load import ImplantLoad, load_files
 from .plan import ViewPlan, plan_files
@@ -28,6 +29,7 @@ __all__ = [
     "Comparison",
     "FileEvaluation",
     "FrameSeries",
+    "Healing",
     "ImplantLoad",
     "ReconstructionFiles",
     "ReconstructionOptions",
@@ -46,6 +48,7 @@ __all__ = [
     "doctor",
     "dry_run",
     "evaluate_files",
+    "follow",
     "load_files",
     "picture_geometry",
     "plan_files",

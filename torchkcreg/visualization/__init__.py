@@ -4,7 +4,7 @@ Each figure function returns a new matplotlib `Figure`. pyplot's state and the s
 """
 
 from .case import case_figure
-from .comparison import comparison_figure, frames_figure
+from .comparison import comparison_figure, frames_figure, healing_figure
 from .displacement_map import displacement_figure, series_figure
 from .errors import error_map_figure, histogram_figure
 from .geometry import geometry_figure
@@ -30,6 +30,7 @@ __all__ = [
     "error_map_figure",
     "frames_figure",
     "geometry_figure",
+    "healing_figure",
     "histogram_figure",
     "history_figure",
     "load_figure",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -89,4 +89,28 @@ def frames_figure(values: Tensor, std: Tensor, names: Sequence[str], *, title: s
     turned = 0 if sum(map(len, names)) < 60 else 45
     figure.axes[1].set_xticks(places, names, rotation=turned, ha="right" if turned else "center")
     figure.axes[1].set_xlabel("frame")
+    return figure
+
+
+def healing_figure(
+    days: Sequence[float], curves: Mapping[str, Sequence[tuple[float, float] | None]], *, xlabel: str = "days"
+) -> Figure:
+    """Quantities of a fracture over time, one panel each, with bars of one standard deviation.
+
+    Args:
+        days: Time of each visit.
+        curves: Value and standard deviation at each visit, None where it was not measured, by the panel's title.
+        xlabel: Name of the time.
+    """
+    figure = new_figure(8.5, 1.4 + 1.7 * len(curves))
+    panels = np.atleast_1d(figure.subplots(len(curves), 1, sharex=True))
+    for panel, (title, numbers) in zip(panels, curves.items(), strict=True):
+        known = [(day, *number) for day, number in zip(days, numbers, strict=True) if number is not None]
+        time, value, std = (np.array(column) for column in zip(*known, strict=True))
+        bars = np.where(np.isfinite(std), std, 0.0)
+        panel.errorbar(time, value, bars, color=COLOURS[0], marker="o", markersize=5, capsize=3)
+        panel.set_title(title, fontsize=10, loc="left")
+        panel.set_ylim(bottom=min(0.0, float((value - bars).min())))
+        open_frame(panel)
+    panels[-1].set_xlabel(xlabel)
     return figure
