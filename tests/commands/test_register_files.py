@@ -5,6 +5,7 @@ import torch
 
 from torchkcreg.cli import main
 from torchkcreg.commands import RegistrationFiles, register_files, resolve_config
+from torchkcreg.commands.register import sample_of
 from torchkcreg.io import read_config, read_run
 from torchkcreg.registration import Callback
 
@@ -114,3 +115,13 @@ def test_a_new_result_has_nothing_of_an_old_one_beside_it(files, tmp_path):
     register_files(files, run, overwrite=True, figures=False)
     assert not (run / "geometry_corrected.json").exists() and not (run / "load" / "load.json").exists()
     assert (run / "load" / "mine.txt").exists()
+
+
+def test_of_a_large_cloud_a_sample_is_written() -> None:
+    few = torch.arange(30.0).reshape(10, 3)
+    assert sample_of(few) is few
+    many = torch.arange(120_000.0)[:, None].expand(-1, 3)
+    sample = sample_of(many)
+    assert len(sample) == 30_000 and len(sample.unique(dim=0)) == 30_000
+    assert 55_000 < float(sample.mean()) < 65_000  # from everywhere
+    torch.testing.assert_close(sample, sample_of(many))

@@ -39,6 +39,7 @@ from .register_inputs import RECORD_KEYS, RegistrationFiles, RegistrationInputs,
 from .report import write_report
 
 _CHECKPOINT_SECONDS = 5.0
+_MOST_NODES_WRITTEN = 30_000
 
 
 def resolve_config(path: Path | None, overrides: dict[str, Any]) -> RegistrationConfig:
@@ -153,9 +154,17 @@ def write_run(
         write_layers(run.path / LAYERS, registered_layers(result, trainer.data))
     if result.view_motions is not None:
         write_geometry(run.path / "geometry_corrected.json", result.corrected(trainer.data.geometry))
-    run.write_result(result, [implant.cloud.points for implant in inputs.implants], initial_to_world=starts)
+    run.write_result(result, [sample_of(implant.cloud.points) for implant in inputs.implants], initial_to_world=starts)
     if figures:
         write_report(run.path)
+
+
+def sample_of(points: Tensor) -> Tensor:
+    """At most 30 000 of the points (N, 3): all half a million of a plate would fill 60 MB."""
+    if len(points) <= _MOST_NODES_WRITTEN:
+        return points
+    chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:_MOST_NODES_WRITTEN]
+    return points[chosen.sort().values.to(points.device)]
 
 
 class _Checkpoints(Callback):
