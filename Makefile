@@ -6,6 +6,7 @@
 # TORCH_PIP_FLAGS   pip options for torch, e.g. --index-url of the build without CUDA
 # EXTRAS   extras to install                                  make test EXTRAS=dev
 # JOBS     number of parallel test processes                make test JOBS=8
+# WORK, DATA   folder of intermediate results, folder of real frames   make validation DATA=knee
 
 VENV ?= .venv
 PYTHON ?= python3
@@ -13,6 +14,7 @@ TORCH ?= torch>=2.10
 TORCH_PIP_FLAGS ?=
 EXTRAS ?= dev,docs,notebooks,simulate
 JOBS ?= 2
+WORK ?= validation
 
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.torchkcreg-is-installed
@@ -20,7 +22,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 SOURCES := $(wildcard torchkcreg/csrc/*.cpp torchkcreg/csrc/*.h torchkcreg/csrc/*/*.cpp torchkcreg/csrc/*/*.h)
 PYTEST := OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python -m pytest -n $(JOBS) --doctest-modules torchkcreg tests
 
-.PHONY: help setup demo test test-full docs lint results format clean
+.PHONY: help setup demo test test-full validation docs lint results format clean
 .DEFAULT_GOAL := help
 
 help:
@@ -28,6 +30,7 @@ help:
 	@echo "make demo       simulate a loaded plate, register it, evaluate and draw the result, into demo/"
 	@echo "make test       run the quick tests and the docstring examples"
 	@echo "make test-full  run all tests, including slow ones and those against RTK"
+	@echo "make validation  measure the accuracy on simulated visits, and on real frames with DATA=folder: an hour"
 	@echo "make docs       build the documentation site in site/; a broken link is an error"
 	@echo "make lint       check with ruff, mypy and clang-format; changes nothing"
 	@echo "make results    write the figures of benchmarks/results into README and documentation"
@@ -54,6 +57,12 @@ test: $(STAMP)
 test-full: $(STAMP)
 	$(PIP) --no-build-isolation --editable ".[$(EXTRAS),parity]"
 	$(PYTEST) --no-skips
+
+# Simulated cases and visits, and with DATA=folder the real frames of a knee, see docs/validation.md.
+validation: $(STAMP)
+	$(BIN)/python benchmarks/demo.py
+	$(BIN)/python benchmarks/visits.py --work $(WORK)/visits --write
+	$(if $(DATA),$(BIN)/python benchmarks/knee_biplane.py $(DATA) --work $(WORK)/knee --write)
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

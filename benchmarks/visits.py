@@ -10,6 +10,7 @@ shifted into a random CAD frame. Visits that were assessed before in the work fo
 import argparse
 import csv
 import json
+import math
 import time
 import warnings
 from dataclasses import replace
@@ -61,7 +62,8 @@ def main() -> None:
     if options.write:
         name = f"visits{'-known' if options.known else ''}.csv"
         with (RESULTS / name).open("w", newline="") as file:
-            table = csv.DictWriter(file, rows[0], lineterminator="\n")
+            names = [name for name in max(rows, key=len) if name != "seconds"]
+            table = csv.DictWriter(file, names, lineterminator="\n", extrasaction="ignore")
             table.writeheader()
             table.writerows(rows)
 
@@ -120,11 +122,11 @@ def measured(folder: Path, known: bool) -> dict[str, object]:
         try:
             assess(files, out, overwrite=True, volumes=False, figures=False)
         except ValueError as error:
-            return {"visit": folder.name, "status": "refused", "why": str(error)[:150]}
+            return {"visit": folder.name, "verdict": "refused", "why": str(error)[:150]}
         seconds = time.perf_counter() - start
     answer = json.loads((out / "assess.json").read_text())["configurations"][0]
     if "rotation_deg" not in answer:
-        return {"visit": folder.name, "status": answer["status"], "why": answer["reasons"][0][:150]}
+        return {"visit": folder.name, "verdict": answer["status"], "why": answer["reasons"][0][:150]}
     numbers = {name: torch.tensor(truth[name], dtype=torch.float64) for name in ("pose", "motion", "axis")}
     motion, unloaded = numbers["motion"], read_run(out / "rest").implants[0]
 
@@ -133,30 +135,27 @@ def measured(folder: Path, known: bool) -> dict[str, object]:
         at = torch.tensor([answer["places"][name]["at_mm"]], dtype=torch.float64)
         return transform_points(invert_rigid(numbers["pose"]), unloaded.warp(at))
 
-    row: dict[str, object] = {"visit": folder.name, "status": answer["status"]}
+    row: dict[str, object] = {"visit": folder.name.removeprefix("visit"), "verdict": answer["status"]}
+    row["plate"] = f"{truth['material']}, {truth['force_n']:.0f} N"
     angle = float(vector_from_rotation(motion[:3, :3]).norm().rad2deg())
-    row |= _triple("rotation_deg", angle, answer["rotation_deg"], answer["rotation_std_deg"], 3)
-    for key, name in (("gap_mm", "gap"), ("axis_mm", "bone axis")):
+    row["tilt (degrees)"] = _told(angle, answer["rotation_deg"], answer["rotation_std_deg"], 2)
+    for name, where in (("gap", "implant"), ("bone axis", "bone axis")):
         if name in answer["places"]:
             place, told = place_of(name), answer["places"][name]
             moved = float((transform_points(motion, place) - place).norm())
-            row |= _triple(key, moved, told["translation_mm"], told["translation_std_mm"], 3)
+            key = f"translation at the {where} (mm)"
+            row[key] = _told(moved, told["translation_mm"], told["translation_std_mm"], 3)
     height = float(place_of("gap")[0] @ numbers["axis"]) - truth["low"]
     sections = np.array(truth["section_loads"])
     moment = np.array([np.interp(height, truth["heights"], sections[:, k]) for k in (3, 4, 5)])
-    row |= _triple(
-        "moment_nm",
-        float(np.linalg.norm(moment)) / 1000,
-        answer["moment_nmm"] / 1000,
-        answer["moment_std_nmm"] / 1000,
-        2,
-    )
-    return row | {"seconds": f"{seconds:.0f}"}
+    found, std = (answer[name] / 1000 for name in ("moment_nmm", "moment_std_nmm"))
+    row["moment (N m)"] = _told(float(np.linalg.norm(moment)) / 1000, found, std, 1)
+    return row if math.isnan(seconds) else row | {"seconds": f"{seconds:.0f}"}
 
 
-def _triple(name: str, true: float, found: float, std: float, digits: int) -> dict[str, str]:
-    """True and found value and the stated standard deviation."""
-    return {f"{name}": f"{true:.{digits}f}", f"{name}_found": f"{found:.{digits}f}", f"{name}_std": f"{std:.{digits}f}"}
+def _told(true: float, found: float, std: float, digits: int) -> str:
+    """A found value, its stated standard deviation and the true value."""
+    return f"{found:.{digits}f} ± {std:.{digits}f} ({true:.{digits}f})"
 
 
 if __name__ == "__main__":
