@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from torchkcreg.cli import main
-from torchkcreg.commands.assess import beyond_the_screws, turned_around
+from torchkcreg.commands.visit_doubts import beyond_the_screws, turned_around
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import read_components, read_mesh, write_config, write_projections
 from torchkcreg.simulation import weight_bearing_case

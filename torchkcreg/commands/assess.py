@@ -22,8 +22,7 @@ from torchkcreg.evaluation import (
     fragments_of,
     relative_motion,
 )
-from torchkcreg.geometry import principal_axes, transform_points
-from torchkcreg.implant import ImplantPointCloud, Screw
+from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import read_geometry, read_mesh, read_run, write_components, write_figure, write_json
 from torchkcreg.io.runs import CONFIG, DEFORMATION
 from torchkcreg.physics import is_elastic, material
@@ -36,11 +35,10 @@ from .assessment import Assessment, LoadedConfiguration, callus_of, load_at
 from .load import load_files
 from .register import register_files
 from .register_inputs import RegistrationFiles
+from .visit_doubts import TURNED_AROUND, beyond_the_screws, fragments_turned, turned_around
 from .visit_page import ASSESSMENT, write_visit_page
 from .visit_volumes import FEWEST_VIEWS, regions_of, volumes_of
 
-TURNED_AROUND = "the implant is symmetric: nothing tells its ends apart, but motion and load do not depend on that"
-_SAMPLE, _SAME_METAL_MM = 1000, 3.0
 _PITCH_MM = 1.0
 _MOST_VIEWS = 12  # of a scan: more take longer than the answer gains
 _FEW = 15  # views; of a scan with more, some are chosen
@@ -302,7 +300,8 @@ class _Visit:
         except ValueError as error:
             fragments = fragments_of(cloud.points, [])
             doubts.append(f"{error}; the ends of the implant stand for the fragments instead")
-        if (beyond := beyond_the_screws(cloud.points, first.screws)) is not None:
+        beyond = beyond_the_screws(cloud.points, first.screws)
+        if beyond is not None and not any(fragments_turned(first, implant, fragments) for implant in loaded):
             doubts.append(beyond)
         if not first.screws:
             doubts.append("no screws show what is fixed to which fragment: the ends of the implant are used instead")
@@ -347,41 +346,6 @@ class _Visit:
             reasons += [text for text in carried.warnings if not text.startswith("the registration is")]
         status = "doubtful" if self.doubts and result.status == "ok" else result.status
         return LoadedConfiguration(name, status, tuple(reasons), load, motion, self.place, carried, gap_load)
-
-
-def turned_around(result: RegistrationResult, nodes: Tensor) -> bool:
-    """True if a rival place of a registered implant is the same metal turned around, since the implant is symmetric.
-
-    Args:
-        result: The registration.
-        nodes: Nodes (N, 3) of its first implant, undeformed.
-    """
-    pose = (result.diagnostics.get("rival") or {}).get("pose")
-    if pose is None:
-        return False
-    nodes = nodes[:: max(1, len(nodes) // _SAMPLE)].double()
-    here = transform_points(result.implants[0].implant_to_world, nodes)
-    there = transform_points(torch.tensor(pose, dtype=torch.float64), nodes)
-    return float(torch.cdist(there, here).amin(1).square().mean().sqrt()) < _SAME_METAL_MM
-
-
-def beyond_the_screws(nodes: Tensor, screws: Sequence[Screw]) -> str | None:
-    """A doubt if the implant reaches further beyond its last screw than the widest gap between screws, else None.
-
-    The fracture may then lie beyond the last screw, and the screws all in one fragment.
-    """
-    if len(screws) < 2:
-        return None
-    _, (*_, axis) = principal_axes(nodes)
-    heights = (nodes.new_tensor([screw.start for screw in screws]) @ axis).sort().values
-    low, high = (nodes @ axis).aminmax()
-    beyond = float(torch.stack([heights[0] - low, high - heights[-1]]).max())
-    if beyond <= float(heights.diff().max()):
-        return None
-    return (
-        f"the implant reaches {beyond:.0f} mm beyond its last screw, further than between any two: the screws may all "
-        "be in one fragment"
-    )
 
 
 def _command(files: RegistrationFiles, folder: Path, options: dict[str, Any]) -> str:
