@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -112,7 +112,7 @@ class FiniteElementDeformation(Deformation):
         weighed: bool = False,
         unused: float = 1.0,
         shares: Tensor | None = None,
-        sides: Tensor | None = None,
+        sides: Sequence[int] | Tensor | None = None,
         covariance: Tensor | None = None,
         rest: Deformation | None = None,
         rest_spread: Tensor | None = None,
@@ -124,11 +124,7 @@ class FiniteElementDeformation(Deformation):
         weight = torch.tensor(load_weight, dtype=torch.float64, device=superelement.expected.device)
         self.register_buffer("weight", weight)  # a buffer, so that checkpoints keep an estimated weight
         self.shares = superelement.expected.new_ones(len(superelement.holds)) if shares is None else shares
-        self.sides = (
-            torch.zeros(len(superelement.holds), dtype=torch.long, device="cpu")
-            if sides is None
-            else sides.long().cpu()
-        )
+        self.sides = (0,) * len(superelement.holds) if sides is None else tuple(int(side) for side in sides)
         self.expected = ExpectedLoads.of(superelement, self.shares, self.sides)
         start = torch.zeros_like(superelement.expected) if amounts is None else amounts.detach().clone()
         self.amounts = nn.Parameter(start.to(superelement.expected))
@@ -189,7 +185,7 @@ class FiniteElementDeformation(Deformation):
         if used and bool(amounts.any()):
             motions = hold_motions(element.hexahedra, element.nodal, [element.holds[hold] for hold in used])
             turns = torch.einsum("a,aui->ui", amounts, motions[..., 3:].to(amounts))
-        self.sides = sides_of_holds(element.centers, element.sections.axis, used, turns)
+        self.sides = tuple(sides_of_holds(element.centers, element.sections.axis, used, turns).tolist())
         self.expected = ExpectedLoads.of(self.superelement, self.shares, self.sides)
 
     def outside(self, points: Tensor) -> Tensor:
@@ -226,7 +222,7 @@ class FiniteElementDeformation(Deformation):
             "load_weight": self.load_weight,
             "unused": self.unused,
             "shares": self.shares.cpu(),
-            "sides": self.sides,
+            "sides": list(self.sides),
             "superelement": self.superelement.to("cpu").to_dict(),
         }
         return content if self.rest is None else content | {"rest": self.rest.to_dict()}

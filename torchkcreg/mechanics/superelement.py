@@ -299,7 +299,9 @@ class ExpectedLoads:
     spread: Tensor
 
     @classmethod
-    def of(cls, element: Superelement, shares: Tensor | None = None, sides: Tensor | None = None) -> ExpectedLoads:
+    def of(
+        cls, element: Superelement, shares: Tensor | None = None, sides: Sequence[int] | None = None
+    ) -> ExpectedLoads:
         """Prior of the loads of an implant.
 
         Screws of a bone fragment move as one rigid body. Most of the load between two fragments goes therefore through
@@ -316,10 +318,13 @@ class ExpectedLoads:
         strengths = scale.expand(len(element.holds), 6) * (1.0 if shares is None else shares.to(scale)[:, None])
         scaled_loads = (torch.cat([element.loads, element.stiff]) / strengths).flatten(1)
         gram = scaled_loads @ scaled_loads.T
-        if sides is not None and element.energy is not None and bool((sides > 0).any()) and bool((sides < 0).any()):
-            loads, centers = torch.cat([element.loads, element.stiff]), element.centers
+        if sides is not None and element.energy is not None and {-1, 1} <= set(sides):
+            loads, where = torch.cat([element.loads, element.stiff]), torch.tensor(sides, device="cpu")
             through = scale * scale.new_tensor([_THROUGH_FORCE] * 3 + [_THROUGH_MOMENT] * 3)
-            wide = fragment_loads(loads, element.energy, centers, sides, scale) * through[:, None]
+            wide = (
+                fragment_loads(loads, element.energy, centers, torch.tensor(sides, device="cpu"), scale)
+                * through[:, None]
+            )
             weighted = gram @ wide.T  # Woodbury: inverse of gram^-1 + wide^T wide
             inner = torch.eye(6, dtype=gram.dtype, device=gram.device) + wide @ weighted
             gram = gram - weighted @ torch.linalg.solve(inner, weighted.T)
