@@ -321,10 +321,7 @@ class ExpectedLoads:
         if sides is not None and element.energy is not None and {-1, 1} <= set(sides):
             loads, where = torch.cat([element.loads, element.stiff]), torch.tensor(sides, device="cpu")
             through = scale * scale.new_tensor([_THROUGH_FORCE] * 3 + [_THROUGH_MOMENT] * 3)
-            wide = (
-                fragment_loads(loads, element.energy, centers, torch.tensor(sides, device="cpu"), scale)
-                * through[:, None]
-            )
+            wide = fragment_loads(loads, element.energy, element.centers, where, scale) * through[:, None]
             weighted = gram @ wide.T  # Woodbury: inverse of gram^-1 + wide^T wide
             inner = torch.eye(6, dtype=gram.dtype, device=gram.device) + wide @ weighted
             gram = gram - weighted @ torch.linalg.solve(inner, weighted.T)
