@@ -64,8 +64,8 @@ def test_the_answer_has_the_motion_the_load_and_the_places_of_the_bone(visit):
     assert stand["moment_std_nmm"] > 0
     assert stand["share_of_yield"] == pytest.approx(stand["stress_mpa"] / 690, rel=0.2)
     assert content["answer"][0].startswith("Under 600 N the upper fragment tilts by")
-    callus = content["callus"]
-    assert callus["axial_std_n_per_mm"] > 0 and len(callus["shares_of_load"]) == 1
+    # the plate is bent by angles, far more than 600 N along the bone's axis would
+    assert "callus" not in content and any("no stiffness of the gap is given" in text for text in content["warnings"])
     assert any("--rest" in line and "--out" in line for line in content["commands"])
 
 

@@ -54,3 +54,11 @@ def test_what_does_not_move_has_no_stiffness_that_could_be_measured() -> None:
         callus_stiffness([still], LEVER, RADIUS)
     with pytest.raises(ValueError, match="does not move"):
         callus_stiffness([], LEVER, RADIUS)
+
+
+def test_a_moment_that_the_force_does_not_explain_contradicts_the_model() -> None:
+    opening = GapLoad(600.0, -8000.0, 500.0, -0.3, 0.05, -0.02, 0.001)
+    assert callus_stiffness([opening], LEVER, RADIUS).contradicts
+    assert not callus_stiffness([load(500.0, 600.0, 0.05)], LEVER, RADIUS).contradicts
+    within = GapLoad(600.0, 600 * LEVER + 300, 500.0, 0.5, 0.05, 0.03, 0.001)  # no tissue, and a noisy moment
+    assert not callus_stiffness([within], LEVER, RADIUS).contradicts

@@ -35,7 +35,14 @@ from .assessment import Assessment, LoadedConfiguration, callus_of, load_at
 from .load import load_files
 from .register import register_files
 from .register_inputs import RegistrationFiles
-from .visit_doubts import TURNED_AROUND, beyond_the_screws, fragments_turned, turned_around
+from .visit_doubts import (
+    CONTRADICTION,
+    MINERAL_WITHOUT_SPECTRUM,
+    TURNED_AROUND,
+    beyond_the_screws,
+    fragments_turned,
+    turned_around,
+)
 from .visit_page import ASSESSMENT, write_visit_page
 from .visit_volumes import FEWEST_VIEWS, regions_of, volumes_of
 
@@ -167,10 +174,16 @@ def assess(
     assessment = Assessment(
         names[0], configurations, assumed, (*doubts, *visit.doubts), tuple(work.commands), folder=out
     )
-    assessment = replace(assessment, callus=visit.callus(configurations))
+    callus = visit.callus(configurations)
+    if callus is not None and callus.contradicts:
+        assessment = replace(assessment, warnings=(*assessment.warnings, CONTRADICTION))
+    else:
+        assessment = replace(assessment, callus=callus)
     _write(assessment, figures)
     if volumes and visit.regions:
         mineral, missing = work.volumes(out / names[0], visit.regions, spacing_mm)
+        if mineral and files.spectrum is None:
+            missing.append(MINERAL_WITHOUT_SPECTRUM)
         assessment = replace(assessment, mineral=tuple(mineral), warnings=(*assessment.warnings, *missing))
         _write(assessment, figures)
     return assessment

@@ -12,6 +12,11 @@ from torchkcreg.geometry import fit_rigid, principal_axes, transform_points, vec
 from torchkcreg.implant import Screw
 from torchkcreg.registration import RegisteredImplant, RegistrationResult
 
+CONTRADICTION = (
+    "no stiffness of the gap is given: the implant carries more than the force along the bone's axis explains, so the "
+    "force acts elsewhere or otherwise"
+)
+MINERAL_WITHOUT_SPECTRUM = "bone mineral was measured without the detected spectrum: its scale is not known"
 TURNED_AROUND = "the implant is symmetric: nothing tells its ends apart, but motion and load do not depend on that"
 _SAMPLE, _SAME_METAL_MM = 1000, 3.0
 _TURNED_RAD = 5e-3  # if fragments turn by more, the fracture lies between their screws

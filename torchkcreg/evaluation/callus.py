@@ -54,6 +54,11 @@ class CallusStiffness:
     shares: tuple[float, ...]
     shares_std: tuple[float, ...]
 
+    @property
+    def contradicts(self) -> bool:
+        """True if the stiffness is negative beyond two standard deviations: the model of two springs does not hold."""
+        return self.axial < -2 * self.axial_std
+
     def to_dict(self) -> dict[str, Any]:
         """The numbers with units in the keys."""
         return {
