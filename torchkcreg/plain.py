@@ -40,6 +40,15 @@ def _plain(content: Any, place: str) -> Any:
     raise ValueError(f"cannot write a {type(content).__name__} as plain data{f' (at {place})' if place else ''}")
 
 
+def std_key(key: str) -> str:
+    """Name of the standard deviation of a number whose name ends in its unit.
+
+    >>> std_key("rotation_x_deg")
+    'rotation_x_std_deg'
+    """
+    return "_std_".join(key.rsplit("_", 1))
+
+
 def finite_number(value: Any, name: str, *, positive: bool = False) -> float:
     """`value` as a float. Raises ValueError unless it is a finite number, and above zero if `positive`."""
     expected = "a positive number" if positive else "a finite number"

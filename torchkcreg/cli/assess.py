@@ -7,9 +7,7 @@ from pathlib import Path
 
 from torchkcreg.console import Answer
 
-from .command import add_command
-
-FAILED = 3  # exit status
+from .command import FAILED, add_command
 
 
 def add_assess(commands) -> None:

@@ -6,6 +6,8 @@ import argparse
 
 from torchkcreg.console import Voice
 
+FAILED = 3  # exit status of a registration that failed
+
 
 def add_command(commands, name: str, run, text: str) -> argparse.ArgumentParser:
     """Add a command with the shared flags, and return its parser.

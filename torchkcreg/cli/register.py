@@ -8,9 +8,7 @@ from typing import Any
 
 from torchkcreg.console import Answer
 
-from .command import add_command
-
-FAILED = 3  # exit status
+from .command import FAILED, add_command
 
 
 def add_register(commands) -> None:

@@ -19,7 +19,7 @@ from torchkcreg.registration import RegisteredImplant
 
 from .load import ImplantLoad
 
-TURNS = ("bending out of plane", "bending in plane", "twist")
+TURN_KEYS = ("bending_out_of_plane", "bending_in_plane", "twist")  # about the axes of a `RelativeMotion`
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +60,14 @@ class LoadedConfiguration:
         if self.gap_load is not None:
             content["moment_nmm"], content["moment_std_nmm"] = _length(*(part[3:] for part in self.gap_load))
             content["force_n"], content["force_std_n"] = _length(*(part[:3] for part in self.gap_load))
-        turns = zip(TURNS, motion.rotation_deg.tolist(), motion.rotation_std_deg.tolist(), strict=True)
-        for name, value, std in turns:
-            key = name.replace(" ", "_")
+        turns = motion.rotation_deg.tolist(), motion.rotation_std_deg.tolist()
+        for key, value, std in zip(TURN_KEYS, *turns, strict=True):
             content[f"{key}_deg"], content[f"{key}_std_deg"] = value, std
         content["places"] = dict(zip((self.place, *BONE_PLACES), self._places(), strict=False))
         if self.gap_load is not None:
-            names = [f"{name.replace(' ', '_')}_moment_nmm" for name in TURNS]
-            for name, value, std in zip(
-                names, self.gap_load[0][3:].tolist(), self.gap_load[1][3:].tolist(), strict=True
-            ):
-                content[name], content[name.replace("_nmm", "_std_nmm")] = value, std
+            moments = (part[3:].tolist() for part in self.gap_load)
+            for key, value, std in zip(TURN_KEYS, *moments, strict=True):
+                content[f"{key}_moment_nmm"], content[f"{key}_moment_std_nmm"] = value, std
         if self.carried is not None:
             share, share_std = self.stress_share
             content |= {"stress_mpa": self.carried.stress, "stress_std_mpa": self.carried.stress_std}

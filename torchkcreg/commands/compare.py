@@ -16,7 +16,7 @@ from torchkcreg.evaluation import AXES, RelativeMotion, fracture_plane, fragment
 from torchkcreg.geometry import transform_points
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import implant_of_run, mesh_of_run, read_mesh, write_figure, write_json, write_text
-from torchkcreg.plain import plain
+from torchkcreg.plain import plain, std_key
 from torchkcreg.registration import RegisteredImplant
 from torchkcreg.visualization import comparison_figure
 
@@ -66,7 +66,7 @@ class Comparison:
     def table(self) -> str:
         """CSV table with a row per loaded run."""
         heads = ["run", *(["load_n"] if self.loads else [])]
-        heads += [column for name in _COLUMNS for column in (name, "_std_".join(name.rsplit("_", 1)))]
+        heads += [column for name in _COLUMNS for column in (name, std_key(name))]
         lines = [",".join(heads)]
         for number, (name, motion) in enumerate(zip(self.names, self.motions, strict=True)):
             pairs = torch.stack(motion.numbers, dim=1).flatten().tolist()

@@ -15,7 +15,7 @@ from torchkcreg.evaluation import FRAME_COLUMNS, FrameMotion, frame_motion
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import read_mesh, write_figure, write_json, write_text, write_tra
 from torchkcreg.io.runs import CONFIG
-from torchkcreg.plain import first_line, plain
+from torchkcreg.plain import first_line, plain, std_key
 from torchkcreg.registration import RegisteredImplant, RegistrationResult
 from torchkcreg.visualization import frames_figure
 
@@ -56,7 +56,7 @@ class FrameSeries:
             implants[name] = [
                 {
                     **{column: _finite(value) for column, value in zip(FRAME_COLUMNS, values, strict=True)},
-                    **{_std(column): _finite(value) for column, value in zip(FRAME_COLUMNS, std, strict=True)},
+                    **{std_key(column): _finite(value) for column, value in zip(FRAME_COLUMNS, std, strict=True)},
                     "pose": pose if bool(pose.isfinite().all()) else None,
                 }
                 for values, std, pose in rows
@@ -70,7 +70,7 @@ class FrameSeries:
 
     def table(self) -> str:
         """CSV table with a row for each frame and implant; empty where there is no number."""
-        heads = ["frame", "status", "implant", *(c for name in FRAME_COLUMNS for c in (name, _std(name)))]
+        heads = ["frame", "status", "implant", *(c for name in FRAME_COLUMNS for c in (name, std_key(name)))]
         lines = [",".join(heads)]
         for number, (frame, status) in enumerate(zip(self.names, self.statuses, strict=True)):
             for name, motion in self.motions.items():
@@ -191,10 +191,6 @@ def _motions(
         return {last: frame_motion(registered(last), clouds[last])}, "world"
     reference = registered(last)
     return {name: frame_motion(registered(name), clouds[name], reference, clouds[last]) for name in moving}, last
-
-
-def _std(column: str) -> str:
-    return "_std_".join(column.rsplit("_", 1))
 
 
 def _finite(value: float) -> float | None:

@@ -13,11 +13,11 @@ from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.io import REPORT, mesh_of_run, read_json, read_mesh, read_run, write_text
 from torchkcreg.visualization import Page, Row, page_html
 
+from .assessment import TURN_KEYS
 from .report import implant_scene, layers_of, picture_of
 
 ASSESSMENT = "assess.json"
 _PITCH_MM = 1.5
-_TURNS = ("bending_out_of_plane", "bending_in_plane", "twist")
 _FIGURES = {
     "volumes/fdk/slices.png": "The unloaded scan by FDK",
     "volumes/kcrec/slices.png": "The unloaded scan by KC-Rec",
@@ -81,7 +81,7 @@ def _pm(value: float, std: float | None, unit: str, form: str = "{:.2f}") -> str
 def _tiles(last: dict[str, Any]) -> list[tuple[str, str, str]]:
     """The most important numbers of a configuration: tilt, gap, moment and stress."""
     under = f"under {last['load_n']:g} N" if "load_n" in last else f"in {last['name']}"
-    turns = [f"{name.replace('_', ' ')} {last[f'{name}_deg']:.2f}" for name in _TURNS]
+    turns = [f"{name.replace('_', ' ')} {last[f'{name}_deg']:.2f}" for name in TURN_KEYS]
     tiles = [("tilt of the upper fragment", _pm(last["rotation_deg"], last["rotation_std_deg"], "°"), ", ".join(turns))]
     place = "bone axis" if "bone axis" in last["places"] else next(iter(last["places"]))
     there = last["places"][place]
@@ -104,12 +104,14 @@ def _tiles(last: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 def _rows(c: dict[str, Any]) -> list[Row]:
     rows = [Row(f"{c['name']}: tilt", f"{c['rotation_deg']:.3f}°", f"{c['rotation_std_deg']:.3f}°")]
-    rows += [Row(name.replace("_", " "), f"{c[f'{name}_deg']:.3f}°", f"{c[f'{name}_std_deg']:.3f}°") for name in _TURNS]
+    rows += [
+        Row(name.replace("_", " "), f"{c[f'{name}_deg']:.3f}°", f"{c[f'{name}_std_deg']:.3f}°") for name in TURN_KEYS
+    ]
     for name, there in c["places"].items():
         about = f"axial {there['axial_mm']:.3f}, shear {there['shear_mm']:.3f} mm"
         value, std = f"{there['translation_mm']:.3f} mm", f"{there['translation_std_mm']:.3f} mm"
         rows.append(Row(f"translation at the {name}", value, std, about))
-    for name in _TURNS:
+    for name in TURN_KEYS:
         if f"{name}_moment_nmm" in c:
             moment, std = (c[f"{name}_moment_{part}nmm"] / 1000 for part in ("", "std_"))
             rows.append(Row(f"moment of {name.replace('_', ' ')}", f"{moment:.2f} N m", f"{std:.2f} N m"))

@@ -58,11 +58,10 @@ def fracture_plane(
     """
     nodes = nodes.double()
     middle, (*_, axis) = principal_axes(nodes)
-    heads = torch.stack([middle, *(nodes.new_tensor(screw.start) for screw in first.screws)])[1:]
+    heads = _heads(first.screws)
     if len(heads) < 2 or not others:
         return None
-    distance = torch.cdist(heads, nodes)
-    near = distance <= distance.amin(1, keepdim=True).clamp_min(first.follow_radius_mm)
+    near = _near(heads, nodes, first.follow_radius_mm)
     turns = []
     for other, change in others:
         there = nodes if change is None else transform_points(change, nodes)
@@ -102,7 +101,7 @@ def fragments_of(
     """
     nodes = nodes.double()
     middle, (*_, axis) = principal_axes(nodes)
-    heads = torch.stack([middle, *(nodes.new_tensor(screw.start) for screw in screws)])[1:]
+    heads = _heads(screws)
     if plane is not None:
         point, normal = plane
         axis = axis if normal is None else torch.nn.functional.normalize(normal.to(axis), dim=0)
@@ -115,13 +114,14 @@ def fragments_of(
     elif plane is not None:
         inside = (heads - middle) @ axis > 0
     else:
-        inside = _beyond_the_widest_gap(heads @ axis)
+        fracture = fracture_among(heads @ axis)
+        inside = heads @ axis > (torch.inf if fracture is None else fracture)
     if not screws:
         reach = height.abs().max() / 3 if plane is None else 0.0
         return _fragments([nodes[height < -reach], nodes[height > reach]], middle, ((), ()))
     if bool(inside.all()) or not bool(inside.any()):
         raise ValueError(f"all {len(screws)} screws belong to one fragment: give the plane of the fracture")
-    near = torch.cdist(heads, nodes) <= torch.cdist(heads, nodes).amin(1, keepdim=True).clamp_min(radius_mm)
+    near = _near(heads, nodes, radius_mm)
     sides = [~inside, inside]
     gap = torch.stack([_innermost(heads[side], heads[~side]) for side in sides]).mean(0)
     gap = _in_the_middle(nodes, gap)
@@ -139,12 +139,15 @@ def _fragments(parts: list[Tensor], gap: Tensor, names: tuple[tuple[str, ...], t
     return Fragments(lower, upper, gap, names)
 
 
-def _beyond_the_widest_gap(heights: Tensor) -> Tensor:
-    order = heights.sort().values
-    if len(order) < 2:
-        return heights > torch.inf
-    widest = int(order.diff().argmax())
-    return heights > (order[widest] + order[widest + 1]) / 2
+def _heads(screws: Sequence[Screw]) -> Tensor:
+    """Heads of the screws, (C, 3)."""
+    return torch.tensor([screw.start for screw in screws], dtype=torch.float64).reshape(-1, 3)
+
+
+def _near(heads: Tensor, nodes: Tensor, radius_mm: float) -> Tensor:
+    """True for the nodes (N, 3) within a radius of each head (C, 3), or nearest to it, (C, N)."""
+    distance = torch.cdist(heads, nodes)
+    return distance <= distance.amin(1, keepdim=True).clamp_min(radius_mm)
 
 
 def _share_inside(mesh: trimesh.Trimesh, screw: Screw) -> float:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchkcreg.deformation import Deviations
 from torchkcreg.geometry import fit_rigid, invert_rigid, transform_points, vector_from_rotation
 from torchkcreg.implant import ImplantPointCloud
 from torchkcreg.registration import RegisteredImplant
@@ -64,71 +63,61 @@ def frame_motion(
     usable = [m is not None and (reference is None or r is not None) for m, r in zip(moving, others, strict=True)]
     if not any(usable):
         raise ValueError("no frame has a registration of the implant")
+    first = usable.index(True)
     places = [_Place.of(m, cloud) if ok else None for m, ok in zip(moving, usable, strict=True)]
     stands = [_Place.of(r, reference_cloud) if ok else None for r, ok in zip(others, usable, strict=True)]
-    first = usable.index(True)
     centre = cloud.points.double().mean(0)
-    nan = torch.full((6,), torch.nan, dtype=torch.float64)
-    values, deviations, poses = [], [], []
-    first_place, first_stand = places[first], stands[first]
-    assert first_place is not None
+    values = torch.full((len(usable), 6), torch.nan, dtype=torch.float64)
+    std = values.clone()
+    poses = torch.full((len(usable), 4, 4), torch.nan, dtype=torch.float64)
+    start = start_stand = None
     for number, (place, stand) in enumerate(zip(places, stands, strict=True)):
-        if place is None:
-            values.append(nan)
-            deviations.append(nan)
-            poses.append(torch.full((4, 4), torch.nan, dtype=torch.float64))
+        if place is None or stand is None:
             continue
-        start, pose = _relative(first_place.pose, first_stand), _relative(place.pose, stand)
-        value = _numbers(start, pose, centre)
-        squares = torch.zeros_like(value)
+        if start is None or start_stand is None:
+            start, start_stand = place, stand
+        involved = (start, start_stand, place, stand)
+        values[number] = _numbers([p.pose for p in involved], centre)
+        poses[number] = invert_rigid(stand.pose) @ place.pose
+        squares = torch.zeros_like(values[number])
         if number != first:
-            for changed in place.poses():
-                squares += (_numbers(start, _relative(changed, stand), centre) - value).square()
-            for changed in first_place.poses():
-                squares += (_numbers(_relative(changed, first_stand), pose, centre) - value).square()
-            if stand is not None and first_stand is not None:
-                for changed in stand.poses():
-                    squares += (_numbers(start, invert_rigid(changed) @ place.pose, centre) - value).square()
-                for changed in first_stand.poses():
-                    moved = invert_rigid(changed) @ first_place.pose
-                    squares += (_numbers(moved, pose, centre) - value).square()
-        involved = [place, first_place, stand, first_stand]
-        unknown = any(p is not None and p.deviations is None for p in involved)
-        values.append(value)
-        deviations.append(nan if unknown else squares.sqrt())
-        poses.append(pose)
-    return FrameMotion(torch.stack(values), torch.stack(deviations), torch.stack(poses))
+            for role, changing in enumerate(involved):
+                for changed in changing.poses:
+                    now = [changed if n == role else p.pose for n, p in enumerate(involved)]
+                    squares += (_numbers(now, centre) - values[number]).square()
+        if all(p.known for p in involved):
+            std[number] = squares.sqrt()
+    return FrameMotion(values, std, poses)
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Nodes of an implant in a frame, the rigid pose that fits them best, and their expected errors."""
+    """The rigid pose that fits an implant best in a frame; the pose with each of its expected errors, if known."""
 
-    nodes: Tensor
-    warped: Tensor
     pose: Tensor
-    deviations: Deviations | None
+    poses: tuple[Tensor, ...] = ()
+    known: bool = True
 
     @classmethod
-    def of(cls, implant: RegisteredImplant | None, cloud: ImplantPointCloud | None) -> _Place | None:
+    def of(cls, implant: RegisteredImplant | None, cloud: ImplantPointCloud | None) -> _Place:
         if implant is None or cloud is None:
-            return None
-        nodes = cloud.points.double() if implant.deviations is None else implant.deviations.points
+            return cls(torch.eye(4, dtype=torch.float64))  # the world, which stands still
+        known = implant.deviations
+        nodes = cloud.points.double() if known is None else known.points
         warped = implant.warp(nodes)
-        return cls(nodes, warped, fit_rigid(nodes, warped), implant.deviations)
-
-    def poses(self) -> list[Tensor]:
-        """The pose with each of the expected errors."""
-        fields = () if self.deviations is None else self.deviations.fields
-        return [fit_rigid(self.nodes, self.warped + field) for field in fields]
+        poses = () if known is None else tuple(fit_rigid(nodes, warped + field) for field in known.fields)
+        return cls(fit_rigid(nodes, warped), poses, known is not None)
 
 
-def _relative(pose: Tensor, stand: _Place | None) -> Tensor:
-    return pose if stand is None else invert_rigid(stand.pose) @ pose
+def _numbers(places: Sequence[Tensor], centre: Tensor) -> Tensor:
+    """Rotation vector, degrees, and translation of the centre, mm, (6,): from a pose to another, each in its stand.
 
-
-def _numbers(start: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
-    """Rotation vector, degrees, and translation of the centre, mm, from one pose (4, 4) to another, (6,)."""
-    turned = torch.rad2deg(vector_from_rotation(pose[:3, :3] @ start[:3, :3].T))
-    before, after = (transform_points(p, centre[None])[0] for p in (start, pose))
-    return torch.cat([turned, after - before])
+    Args:
+        places: First pose and its stand, second pose and its stand, (4, 4) each.
+        centre: Point (3,) of the implant.
+    """
+    start, start_stand, pose, stand = places
+    before, after = invert_rigid(start_stand) @ start, invert_rigid(stand) @ pose
+    turned = torch.rad2deg(vector_from_rotation(after[:3, :3] @ before[:3, :3].T))
+    moved = transform_points(after, centre[None]) - transform_points(before, centre[None])
+    return torch.cat([turned, moved[0]])

@@ -316,10 +316,11 @@ class ExpectedLoads:
         num_amounts = element.num_amounts
         scale = element.loads.new_tensor([element.prior.force] * 3 + [element.prior.moment] * 3)
         strengths = scale.expand(len(element.holds), 6) * (1.0 if shares is None else shares.to(scale)[:, None])
-        scaled_loads = (torch.cat([element.loads, element.stiff]) / strengths).flatten(1)
+        loads = torch.cat([element.loads, element.stiff])
+        scaled_loads = (loads / strengths).flatten(1)
         gram = scaled_loads @ scaled_loads.T
         if sides is not None and element.energy is not None and {-1, 1} <= set(sides):
-            loads, where = torch.cat([element.loads, element.stiff]), torch.tensor(sides, device="cpu")
+            where = torch.tensor(sides, device="cpu")
             through = scale * scale.new_tensor([_THROUGH_FORCE] * 3 + [_THROUGH_MOMENT] * 3)
             wide = fragment_loads(loads, element.energy, element.centers, where, scale) * through[:, None]
             weighted = gram @ wide.T  # Woodbury: inverse of gram^-1 + wide^T wide
